@@ -1,0 +1,1 @@
+"""Pure numbers: arrays in, arrays out; no files, no coordinate systems."""
