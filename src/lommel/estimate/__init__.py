@@ -1,0 +1,1 @@
+"""What is solved for: albedo, exposure, haze, surface."""

@@ -1,0 +1,1 @@
+"""One file format per module; every reader returns arrays and ``scene`` objects."""

@@ -1,0 +1,281 @@
+"""GeoTIFFs and every other raster GDAL reads: frames, pixels on a grid, and products.
+
+Reading is windowed: only the part of a file that a grid needs leaves the disk. Whatever marks a
+pixel as missing (nodata, mask, alpha or a second band that is zero) becomes NaN.
+Products are Cloud-Optimized GeoTIFFs, written beside their place and renamed when whole.
+rasterio lives in this module only. Most callers want `read_on_grid` and `write_raster`.
+"""
+
+import os
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rasterio
+import rasterio.shutil
+from rasterio.enums import ColorInterp, Resampling
+from rasterio.errors import NotGeoreferencedWarning, RasterioError, RasterioIOError
+from rasterio.warp import reproject
+from rasterio.windows import Window as FileWindow
+
+from lommel.errors import GeometryError, InputError
+from lommel.scene.body import MOON
+from lommel.scene.grid import Grid, Window, read_crs
+
+PIXEL_LIMIT = 2**34  # pixels of one raster side by side; beyond it the header is not believable
+DOWNSAMPLING = 1.5  # input pixels per post from which area means replace interpolation
+MARGIN = 4  # pixels read around a window so that interpolation sees its neighbours
+
+
+@dataclass(frozen=True)
+class RasterInfo:
+    """What a raster's header says.
+
+    Attributes
+    ----------
+    path : Path
+    shape : tuple of int
+        Rows and columns.
+    bands : int
+    dtype : str
+        Of the first band.
+    nodata : float or None
+    has_mask_band : bool
+        The second band is an 8-bit mask or alpha, not data.
+    grid : Grid or None
+        None when the raster carries no CRS or no transform.
+    """
+
+    path: Path
+    shape: tuple[int, int]
+    bands: int
+    dtype: str
+    nodata: float | None
+    has_mask_band: bool
+    grid: Grid | None
+
+    @property
+    def saturation(self):
+        """The value at which 8-bit images clip; infinity for every other type."""
+        return 255.0 if self.dtype == "uint8" else np.inf
+
+
+def raster_info(path, body=MOON):
+    """Header of a raster, checked to be usable.
+
+    Parameters
+    ----------
+    path : path
+    body : Body
+        The CRS, if any, must be one of this body.
+
+    Returns
+    -------
+    info : RasterInfo
+    """
+    with _open(path) as file:
+        rows, cols = file.shape
+        if rows * cols > PIXEL_LIMIT:
+            raise InputError(
+                f"{path}: the header claims {rows} x {cols} pixels, more than {PIXEL_LIMIT}. "
+                "The file is damaged, or has to be cut first."
+            )
+        if file.dtypes[0].startswith("complex"):
+            raise InputError(f"{path}: band 1 is {file.dtypes[0]}. Give a raster of real numbers.")
+        return RasterInfo(
+            path=Path(path),
+            shape=(rows, cols),
+            bands=file.count,
+            dtype=file.dtypes[0],
+            nodata=file.nodata,
+            has_mask_band=_has_mask_band(file),
+            grid=_grid_of(file, path, body),
+        )
+
+
+def read_grid(path, body=MOON):
+    """The grid of a map-projected raster; an error when it has no CRS."""
+    grid = raster_info(path, body).grid
+    if grid is None:
+        raise GeometryError(
+            f"{path} has no CRS or no transform, so its place is unknown. Assign one with "
+            "gdal_edit.py -a_srs and -a_ullr, or give a map-projected raster."
+        )
+    return grid
+
+
+def read_pixels(path, window=None):
+    """First band as float32, missing pixels NaN.
+
+    Parameters
+    ----------
+    path : path
+    window : Window, optional
+        Part to read; the whole raster by default.
+
+    Returns
+    -------
+    values : float32 array (rows, cols), in the file's unit (scale and offset applied)
+    """
+    with _open(path) as file:
+        window = window or Window(0, 0, *file.shape)
+        part = FileWindow(window.col, window.row, window.cols, window.rows)
+        try:
+            values = file.read(1, window=part).astype(np.float32)
+            missing = file.read_masks(1, window=part) == 0
+            if _has_mask_band(file):
+                missing |= file.read(2, window=part) == 0
+        except (RasterioError, ValueError) as error:
+            raise InputError(f"{path} cannot be read, it may be truncated: {error}") from error
+        scale, offset = file.scales[0], file.offsets[0]
+    if (scale, offset) != (1.0, 0.0):
+        values = np.float32(scale) * values + np.float32(offset)
+    values[missing | ~np.isfinite(values)] = np.nan
+    return values
+
+
+def read_on_grid(path, grid, body=MOON):
+    """First band resampled onto a grid: area means from finer input, else cubic.
+
+    Missing input never leaks: a post is NaN when the input pixels at its place are missing.
+
+    Parameters
+    ----------
+    path : path
+    grid : Grid
+    body : Body
+
+    Returns
+    -------
+    values : float32 array (rows, cols), NaN where the raster has nothing
+    """
+    source = read_grid(path, body)
+    part = _needed_part(source, grid)
+    if part.is_empty:
+        return np.full(grid.shape, np.nan, np.float32)
+    values, source = read_pixels(path, part), source.cut(part)
+    if source.is_same(grid):
+        return values
+    return resample(values, source, grid)
+
+
+def resample(values, source, grid):
+    """An array on one grid brought onto another; see `read_on_grid` for how.
+
+    Parameters
+    ----------
+    values : float32 array (rows, cols) on ``source``
+    source, grid : Grid
+
+    Returns
+    -------
+    values : float32 array on ``grid``, NaN where the source has nothing
+    """
+    is_finer = max(grid.spacing) > DOWNSAMPLING * max(source.spacing)
+    method = Resampling.average if is_finer else Resampling.cubic
+    result = np.full(grid.shape, np.nan, np.float32)
+    frames = {
+        "src_transform": source.affine,
+        "src_crs": source.crs.to_wkt(),
+        "dst_transform": grid.affine,
+        "dst_crs": grid.crs.to_wkt(),
+        "src_nodata": np.nan,
+        "dst_nodata": np.nan,
+        "tolerance": 0.0,  # exact transform at every post: the default errs by 1/8 pixel
+    }
+    reproject(values, result, resampling=method, **frames)
+    if not is_finer and np.isnan(values).any():  # cubic reaches 2 pixels: restore the hole's shape
+        nearest = np.full(grid.shape, np.nan, np.float32)
+        reproject(values, nearest, resampling=Resampling.nearest, **frames)
+        result[np.isnan(nearest)] = np.nan
+    return result
+
+
+def write_raster(path, values, grid, description, unit="", nodata=np.nan):
+    """One band as a Cloud-Optimized GeoTIFF; it appears whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+    values : array (rows, cols)
+        Floats are stored as float32, integers as they are.
+    grid : Grid
+    description, unit : str
+        Band description and unit, as GIS programs show them.
+    nodata : float
+    """
+    path = Path(path)
+    values = np.asarray(values)
+    if values.dtype.kind == "f":
+        values = values.astype(np.float32)
+    else:
+        nodata = None
+    profile = {
+        "driver": "GTiff",
+        "height": grid.shape[0],
+        "width": grid.shape[1],
+        "count": 1,
+        "dtype": values.dtype,
+        "crs": grid.crs.to_wkt(),
+        "transform": grid.affine,
+        "nodata": nodata,
+    }
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        with rasterio.MemoryFile() as memory:
+            with memory.open(**profile) as file:
+                file.write(values, 1)
+                file.set_band_description(1, description)
+                file.set_band_unit(1, unit)
+            with memory.open() as file:
+                rasterio.shutil.copy(
+                    file,
+                    partial,
+                    driver="COG",
+                    compress="deflate",
+                    predictor="yes",
+                    overview_resampling="average",
+                    num_threads=2,
+                )
+        os.replace(partial, path)
+    except (RasterioError, OSError) as error:
+        raise InputError(f"{path} cannot be written: {error}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _open(path):
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            return rasterio.open(path)
+    except RasterioIOError as error:
+        reason = "there is no such file" if not Path(path).exists() else str(error)
+        raise InputError(f"{path} cannot be opened as a raster: {reason}") from error
+
+
+def _has_mask_band(file):
+    if file.count != 2:
+        return False
+    return file.dtypes[1] == "uint8" or file.colorinterp[1] == ColorInterp.alpha
+
+
+def _grid_of(file, path, body):
+    if file.crs is None or file.transform.is_identity:
+        return None
+    return Grid(file.shape, file.transform, read_crs(file.crs.to_wkt(), body, str(path)), body)
+
+
+def _needed_part(source, grid):
+    window = grid.footprint(source)
+    if window.is_empty:
+        return window
+    margin = MARGIN + int(np.ceil(max(grid.spacing) / min(source.spacing)))
+    wide = Window(
+        window.row - margin,
+        window.col - margin,
+        window.rows + 2 * margin,
+        window.cols + 2 * margin,
+    )
+    return wide.intersection(source.window)

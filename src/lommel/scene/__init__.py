@@ -1,0 +1,1 @@
+"""Where things are: bodies, grids, cameras, light and view."""
