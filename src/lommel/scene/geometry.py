@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lommel.scene.grid import Window
+
 
 @dataclass(frozen=True)
 class ViewingGeometry:
@@ -70,3 +72,28 @@ def viewing_geometry(xyz, normals, sun_position, spacecraft_position):
         np.einsum("...i,...i", normals, to_camera),
         np.arccos(cos_phase),
     )
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One image brought onto the grid of the run.
+
+    Attributes
+    ----------
+    name : str
+        File name, the key in every table.
+    window : Window
+        The posts the image covers, in the grid of the run.
+    measured : float32 array (window.rows, window.cols), image units
+        Brightness; NaN where missing.
+    sun_position, spacecraft_position : array (3,), m, body-fixed
+    saturation : float, image units
+        Values from here on are clipped; infinity when the format does not clip.
+    """
+
+    name: str
+    window: Window
+    measured: np.ndarray
+    sun_position: np.ndarray
+    spacecraft_position: np.ndarray
+    saturation: float = np.inf
