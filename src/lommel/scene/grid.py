@@ -92,7 +92,7 @@ class Grid:
     def bounds(self):
         """Outer pixel edges xmin, ymin, xmax, ymax, in CRS units."""
         rows, cols = self.shape
-        corners = [self.affine * corner for corner in ((0, 0), (cols, 0), (0, rows), (cols, rows))]
+        corners = [self.affine @ corner for corner in ((0, 0), (cols, 0), (0, rows), (cols, rows))]
         x, y = zip(*corners, strict=True)
         return min(x), min(y), max(x), max(y)
 
@@ -107,7 +107,7 @@ class Grid:
 
     def cut(self, window):
         """The part of this grid inside a window, as a grid of its own."""
-        affine = self.affine * Affine.translation(window.col, window.row)
+        affine = self.affine @ Affine.translation(window.col, window.row)
         return replace(self, shape=window.shape, affine=affine)
 
     def lonlat_at(self, row, col):
@@ -122,7 +122,7 @@ class Grid:
         longitude, latitude : array (...), rad
         """
         row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
-        x, y = self.affine * (col + 0.5, row + 0.5)
+        x, y = self.affine @ (col + 0.5, row + 0.5)
         longitude, latitude = _to_geodetic(self.crs.to_wkt()).transform(x, y)
         return np.radians(longitude), np.radians(latitude)
 
@@ -141,7 +141,7 @@ class Grid:
         latitude = np.degrees(np.asarray(latitude, float))
         transformer = _to_geodetic(self.crs.to_wkt())
         x, y = transformer.transform(longitude, latitude, direction="INVERSE")
-        col, row = ~self.affine * (np.asarray(x), np.asarray(y))
+        col, row = ~self.affine @ (np.asarray(x), np.asarray(y))
         if self.crs.is_geographic:  # the same meridian may be written 360 degrees away
             turn = 360.0 / self.affine.a
             col = col - turn * np.round((col - self.shape[1] / 2) / turn)
