@@ -1,0 +1,270 @@
+"""What a stage reads: one terrain, one grid, many images, and the reasons for images left out.
+
+An image that cannot be used is reported and left out; a run ends only when none is left.
+Most callers want `read_scene`.
+"""
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lommel.errors import GeometryError, InputError, LommelError
+from lommel.io.positions import find_position, read_positions
+from lommel.io.raster import raster_info, read_grid, read_on_grid
+from lommel.scene.body import MOON
+from lommel.scene.geometry import Observation
+from lommel.scene.grid import Grid, Window, bounds_in, grid_from_bounds, read_crs
+
+DEM_IS_FINE_ENOUGH = 1.5  # image pixels per DEM post up to which the DEM's own grid is kept
+
+
+@dataclass(frozen=True)
+class GridSettings:
+    """Where the products' posts stand; every value left out is chosen from the inputs.
+
+    Attributes
+    ----------
+    spacing : float, m, or None
+    crs : str or None
+        WKT, PROJ text or authority code.
+    bounds : tuple of float or None
+        xmin, ymin, xmax, ymax in units of the CRS.
+    """
+
+    spacing: float | None = None
+    crs: str | None = None
+    bounds: tuple[float, float, float, float] | None = None
+
+    @property
+    def is_automatic(self):
+        """True when nothing was asked for."""
+        return self.spacing is None and self.crs is None and self.bounds is None
+
+
+@dataclass(frozen=True)
+class SceneFiles:
+    """The files that describe a scene.
+
+    Attributes
+    ----------
+    images, dems : tuple of Path
+    sun_positions, spacecraft_positions : Path or None
+        Position tables.
+    positions_unit : {'auto', 'm', 'km'}
+    """
+
+    images: tuple[Path, ...]
+    dems: tuple[Path, ...]
+    sun_positions: Path | None = None
+    spacecraft_positions: Path | None = None
+    positions_unit: str = "auto"
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """An image that was left out.
+
+    Attributes
+    ----------
+    name : str
+    reason : str
+    """
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything an estimator needs, on one grid.
+
+    Attributes
+    ----------
+    grid : Grid
+    heights : float32 array (rows, cols), m
+        The terrain; NaN in holes.
+    observations : list of Observation
+    skipped : list of Skipped
+    """
+
+    grid: Grid
+    heights: np.ndarray
+    observations: list[Observation]
+    skipped: list[Skipped]
+
+
+def read_scene(files, grid_settings=None, prefer="images", body=MOON, progress=iter):
+    """Terrain and images on one grid.
+
+    Parameters
+    ----------
+    files : SceneFiles
+    grid_settings : GridSettings, optional
+    prefer : {'images', 'dem'}
+        Whose posts the automatic grid takes over.
+    body : Body
+    progress : callable
+        Wraps the iterable of images, as ``rich.progress.track`` does.
+
+    Returns
+    -------
+    scene : Scene
+    """
+    _refuse_duplicates(files.images)
+    dem_grids = [read_grid(path, body) for path in files.dems]
+    image_grids, skipped = _place_images(files.images, dem_grids, body)
+    if not image_grids:
+        raise InputError("No image can be used.\n" + _listing(skipped))
+    grid = choose_grid(
+        list(image_grids.values()), dem_grids, grid_settings or GridSettings(), prefer, body
+    )
+    heights = read_heights(files.dems, grid, body)
+    tables = _read_tables(files, body)
+    observations = []
+    for path in progress(list(image_grids)):
+        try:
+            observations.append(_observe(path, image_grids[path], grid, heights, tables, body))
+        except LommelError as error:
+            skipped.append(Skipped(path.name, str(error)))
+    if not observations:
+        raise InputError("No image can be used.\n" + _listing(skipped))
+    return Scene(grid, heights, observations, skipped)
+
+
+def choose_grid(image_grids, dem_grids, settings, prefer="images", body=MOON):
+    """The grid of the products.
+
+    Automatic: the area that images and DEM share, in the CRS of the preferred input, at the
+    images' own spacing. With ``prefer='dem'`` the DEM's posts are kept as they are, unless the
+    images are finer than the DEM by more than `DEM_IS_FINE_ENOUGH`.
+
+    Parameters
+    ----------
+    image_grids, dem_grids : list of Grid
+    settings : GridSettings
+    prefer : {'images', 'dem'}
+    body : Body
+
+    Returns
+    -------
+    grid : Grid
+    """
+    preferred = dem_grids[0] if prefer == "dem" else image_grids[0]
+    crs = read_crs(settings.crs, body, "--crs") if settings.crs else preferred.crs
+    gsd = float(np.median([max(grid.spacing) for grid in image_grids]))
+    dem_spacing = max(dem_grids[0].spacing)
+    keeps_dem = prefer == "dem" and len(dem_grids) == 1 and dem_spacing < DEM_IS_FINE_ENOUGH * gsd
+    if settings.is_automatic and (keeps_dem or len(image_grids) == 1):
+        own = dem_grids[0] if keeps_dem else image_grids[0]
+        others = image_grids if keeps_dem else dem_grids
+        return own.cut(_enclosing([grid.footprint(own) for grid in others]))
+    spacing = settings.spacing or (dem_spacing if keeps_dem else gsd)
+    bounds = settings.bounds or _shared_bounds(image_grids, dem_grids, crs)
+    return grid_from_bounds(bounds, spacing, crs, body)
+
+
+def read_heights(paths, grid, body=MOON):
+    """Terrain on a grid: the mean of the DEMs where they overlap (step 1 of the albedo paper).
+
+    Parameters
+    ----------
+    paths : sequence of path
+    grid : Grid
+    body : Body
+
+    Returns
+    -------
+    heights : float32 array (rows, cols), m; NaN where no DEM knows
+    """
+    total = np.zeros(grid.shape)
+    count = np.zeros(grid.shape, np.int16)
+    for path in paths:
+        window = read_grid(path, body).footprint(grid)
+        if window.is_empty:
+            continue
+        part = read_on_grid(path, grid.cut(window), body)
+        known = np.isfinite(part)
+        total[window.slices] += np.where(known, part, 0.0)
+        count[window.slices] += known
+    if not count.any():
+        raise InputError(
+            "The DEM has no height inside the output grid. Check --bounds, and that DEM and "
+            "images show the same region."
+        )
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
+
+
+def _place_images(paths, dem_grids, body):
+    grids, skipped = {}, []
+    for path in paths:
+        try:
+            grid = read_grid(path, body)
+            if all(dem.footprint(grid).is_empty for dem in dem_grids):
+                raise GeometryError(f"{path.name} does not overlap the DEM.")
+            grids[path] = grid
+        except LommelError as error:
+            skipped.append(Skipped(path.name, str(error)))
+    return grids, skipped
+
+
+def _observe(path, image_grid, grid, heights, tables, body):
+    window = image_grid.footprint(grid)
+    if window.is_empty:
+        raise GeometryError(f"{path.name} does not overlap the output grid.")
+    positions = [find_position(table, path.name, source) for source, table in tables]
+    measured = read_on_grid(path, grid.cut(window), body)
+    if not (np.isfinite(measured) & np.isfinite(heights[window.slices])).any():
+        raise GeometryError(f"{path.name} has no valid pixel where the DEM is known.")
+    info = raster_info(path, body)
+    return Observation(path.name, window, measured, *positions, info.saturation)
+
+
+def _read_tables(files, body):
+    tables = []
+    for kind, path in (("sun", files.sun_positions), ("spacecraft", files.spacecraft_positions)):
+        if path is None:
+            raise InputError(
+                f"No {kind} positions given. Name a table of lines KEY x y z with "
+                f"--{kind}-positions."
+            )
+        tables.append((path, read_positions(path, kind, body, files.positions_unit)))
+    return tables
+
+
+def _refuse_duplicates(paths):
+    if not paths:
+        raise InputError("No image given. Name at least one image file.")
+    counts = Counter(path.name for path in paths)
+    twice = [name for name, count in counts.items() if count > 1]
+    if twice:
+        raise InputError(
+            f"{', '.join(twice[:5])} given more than once. File names are the images' names in "
+            "every table and product: give each image once."
+        )
+
+
+def _shared_bounds(image_grids, dem_grids, crs):
+    def union(grids):
+        bounds = np.array([bounds_in(grid, crs) for grid in grids])
+        return np.concatenate([bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)])
+
+    images, dems = union(image_grids), union(dem_grids)
+    low, high = np.maximum(images[:2], dems[:2]), np.minimum(images[2:], dems[2:])
+    return (*low.tolist(), *high.tolist())
+
+
+def _enclosing(windows):
+    windows = [window for window in windows if not window.is_empty]
+    row = min(window.row for window in windows)
+    col = min(window.col for window in windows)
+    last_row = max(window.row + window.rows for window in windows)
+    last_col = max(window.col + window.cols for window in windows)
+    return Window(row, col, last_row - row, last_col - col)
+
+
+def _listing(skipped):
+    lines = [f"  {skip.name}: {skip.reason}" for skip in skipped[:20]]
+    more = [f"  ... and {len(skipped) - 20} more"] if len(skipped) > 20 else []
+    return "\n".join(lines + more)

@@ -1,0 +1,165 @@
+"""The output folder and the record of a run: whole or not at all.
+
+A stage writes into a hidden folder beside the one asked for; the folder takes its name when the
+stage is done, and is removed when it fails. Most callers want `output_folder` and `RunRecord`.
+"""
+
+import hashlib
+import json
+import os
+import platform
+import resource
+import shutil
+import time
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from lommel import __version__
+from lommel.errors import InputError
+
+PACKAGES = ("numpy", "numba", "scipy", "rasterio", "pyproj")
+
+
+@contextmanager
+def output_folder(path, overwrite=False):
+    """A folder to write into that becomes ``path`` when the block ends well.
+
+    Parameters
+    ----------
+    path : path
+    overwrite : bool
+        Replace a folder that exists; without it an existing folder is an error.
+
+    Yields
+    ------
+    staging : Path
+        Where to write.
+    """
+    path = Path(path).absolute()
+    if path.is_file():
+        raise InputError(f"--output {path} is a file. Name a folder.")
+    if path.exists() and any(path.iterdir()) and not overwrite:
+        raise InputError(
+            f"--output {path} exists and is not empty. Name another folder, or replace it "
+            "with --overwrite."
+        )
+    staging = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        shutil.rmtree(staging, ignore_errors=True)
+        staging.mkdir(parents=True)
+    except OSError as error:
+        raise InputError(
+            f"--output {path} cannot be written: {error.strerror}. Name a folder on a disk "
+            "with space where you may write."
+        ) from error
+    try:
+        yield staging
+        replaced = path.with_name(f".{path.name}.{os.getpid()}.replaced")
+        if path.exists():
+            path.rename(replaced)
+        staging.rename(path)
+        shutil.rmtree(replaced, ignore_errors=True)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+@dataclass
+class RunRecord:
+    """What a run was asked, what it did and how it ended; written as ``run.json``.
+
+    Attributes
+    ----------
+    command : str
+    settings : dict
+        Every setting with its value, as resolved.
+    inputs : list of dict
+        Path, bytes and digest of each input file.
+    stages : list of dict
+        Name, seconds and peak memory of each stage.
+    skipped : list of dict
+        Images left out and why.
+    results : dict of str to number
+        Names carry the unit.
+    history : list of dict
+        Cost and step of each iteration.
+    outcome : dict
+        Name and sentence.
+    """
+
+    command: str
+    settings: dict
+    inputs: list[dict] = field(default_factory=list)
+    stages: list[dict] = field(default_factory=list)
+    skipped: list[dict] = field(default_factory=list)
+    results: dict = field(default_factory=dict)
+    history: list[dict] = field(default_factory=list)
+    outcome: dict = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name):
+        """Measure a stage: wall seconds, and the process's peak memory so far in MB."""
+        start = time.perf_counter()
+        yield
+        seconds = time.perf_counter() - start
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # ru_maxrss is in KiB
+        self.stages.append(
+            {"name": name, "seconds": round(seconds, 3), "peak_memory_mb": round(peak, 1)}
+        )
+
+    def add_inputs(self, paths):
+        """Note size and digest of input files; files that cannot be read are noted as such."""
+        self.inputs.extend(_digest(Path(path)) for path in paths)
+
+    def add_skipped(self, skipped):
+        """Note images left out: objects with ``name`` and ``reason``."""
+        self.skipped.extend({"image": skip.name, "reason": skip.reason} for skip in skipped)
+
+    def write(self, folder):
+        """Write ``run.json`` into a folder."""
+        content = {
+            "lommel": __version__,
+            "created": datetime.now(UTC).isoformat(timespec="seconds"),
+            **asdict(self),
+            "versions": {name: _version(name) for name in PACKAGES},
+            "machine": _machine(),
+        }
+        known = json.loads(json.dumps(content, default=_plain), parse_constant=lambda _: None)
+        text = json.dumps(known, indent=1, allow_nan=False)
+        (Path(folder) / "run.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _digest(path):
+    try:
+        with open(path, "rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        return {"path": str(path), "bytes": path.stat().st_size, "sha256": digest}
+    except OSError as error:
+        return {"path": str(path), "bytes": None, "sha256": None, "error": error.strerror}
+
+
+def _version(name):
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def _machine():
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    return {
+        "cpu": platform.machine(),
+        "cores": os.cpu_count(),
+        "memory_gb": round(memory, 1),
+        "python": platform.python_version(),
+        "system": platform.system(),
+    }
+
+
+def _plain(value):
+    """Paths, NumPy numbers and arrays as JSON knows them."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return str(value)
