@@ -15,7 +15,7 @@ install: $(STAMP)  ## create .venv with .venv/bin/lommel, redone when pyproject.
 
 $(STAMP): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	$(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[dev]'
 	touch $(STAMP)
 
 test: $(STAMP)  ## run the tests, and every example in docstrings, README and docs
