@@ -1,0 +1,294 @@
+r"""The normal operator of one Gauss-Newton step, matrix-free, and its transfer between grids.
+
+The unknowns are values ``u`` at posts (rows, cols). Three kinds of terms meet in the operator:
+
+.. math:: A = D^T G D + K^T W K + m
+
+`D` takes the two slope differences of a cell from its four posts,
+
+.. math:: p = (u_{01} - u_{00} + u_{11} - u_{10}) / 2, \qquad
+          q = (u_{10} - u_{00} + u_{11} - u_{01}) / 2,
+
+`G` is one symmetric 2x2 tensor per cell (rows - 1, cols - 1), `K` the second differences
+:math:`u_{xx}`, :math:`u_{yy}` (three posts each) and :math:`u_{xy}` (the cell's four posts), and
+`m` a mass per post. Each is a sum of positive semidefinite elements of at most four posts, so the
+eigenvalues of :math:`\mathrm{diag}(A)^{-1} A` lie in [0, 4] whatever the data: the smoother needs
+no estimate. All arrays are float32; every loop runs along rows.
+"""
+
+import numpy as np
+from numba import njit, prange
+
+BLOCK = 32  # rows per parallel work item; fixed, so sums do not depend on the thread count
+LARGEST_EIGENVALUE = 4.0  # of diag(A)^-1 A: the number of posts of the largest element
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
+def _cell_fluxes(upper, lower, gpp, gpq, gqq, twist, hourglass, top0, top1, bottom0, bottom1):
+    """What one row of cells adds to the posts above and below it.
+
+    Buffers hold one entry per cell, shifted by one, with zeros at both ends: the post ``c`` takes
+    ``top0[c + 1]`` from the cell at its right and ``top1[c]`` from the one at its left.
+    """
+    half = np.float32(0.5)
+    for c in range(gpp.size):
+        down_left = lower[c] - upper[c]
+        down_right = lower[c + 1] - upper[c + 1]
+        p = half * (upper[c + 1] - upper[c] + lower[c + 1] - lower[c])
+        q = half * (down_left + down_right)
+        fp = half * (gpp[c] * p + gpq[c] * q)
+        fq = half * (gpq[c] * p + gqq[c] * q)
+        bend = (twist + hourglass * (gpp[c] + gqq[c])) * (down_right - down_left)
+        top0[c + 1] = bend - fp - fq
+        top1[c + 1] = fp - fq - bend
+        bottom0[c + 1] = fq - fp - bend
+        bottom1[c + 1] = fp + fq + bend
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
+def _second_differences(u, out):
+    """``out[c + 1] = u[c - 1] - 2 u[c] + u[c + 1]`` inside, zero at both ends."""
+    two = np.float32(2.0)
+    for c in range(1, u.size - 1):
+        out[c + 1] = u[c - 1] - two * u[c] + u[c + 1]
+
+
+@njit(cache=True, nogil=True)
+def _column_weights(row, rows, weights):
+    """Weights of rows - 2 ... + 2 in the second differences along columns and their transpose."""
+    weights[:] = 0.0
+    for centre, factor in ((row - 1, 1.0), (row, -2.0), (row + 1, 1.0)):
+        if 1 <= centre <= rows - 2:
+            at = centre - row + 2
+            weights[at - 1] += factor
+            weights[at] -= 2.0 * factor
+            weights[at + 1] += factor
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
+def _gather_row(u_2, u_1, u0, u1, u2, w, wxx, mass, bend, top0, top1, bottom0, bottom1, out):
+    """Sum of all terms at the posts of one row."""
+    w_2, w_1, w0, w1, w2 = w[0], w[1], w[2], w[3], w[4]
+    two = np.float32(2.0)
+    for c in range(out.size):
+        along = bend[c] - two * bend[c + 1] + bend[c + 2]
+        across = w_2 * u_2[c] + w_1 * u_1[c] + w0 * u0[c] + w1 * u1[c] + w2 * u2[c]
+        cells = (top0[c + 1] + top1[c]) + (bottom0[c + 1] + bottom1[c])
+        out[c] = cells + wxx * along + across + mass * u0[c]
+
+
+@njit(cache=True, parallel=True)
+def apply_operator(u, gpp, gpq, gqq, curvature, hourglass, mass, out):
+    """``out = A u``.
+
+    Parameters
+    ----------
+    u, out : float32 array (rows, cols)
+    gpp, gpq, gqq : float32 array (rows - 1, cols - 1)
+        The tensor of each cell, per squared difference.
+    curvature : float32 array (3,)
+        Weights of u_xx (along a row), u_xy and u_yy, per squared second difference.
+    hourglass : float
+        Share of tr(G) that resists a cell's twist.
+    mass : float
+        Weight of each post.
+    """
+    rows, cols = u.shape
+    blocks = (rows + BLOCK - 1) // BLOCK
+    for block in prange(blocks):
+        first = np.int64(block) * BLOCK
+        last = min(first + BLOCK, rows)
+        flux = np.zeros((4, cols + 1), np.float32)
+        above = np.zeros((2, cols + 1), np.float32)
+        bend = np.zeros(cols + 2, np.float32)
+        weights = np.zeros(5, np.float32)
+        if first > 0:
+            r = first - 1
+            _cell_fluxes(
+                u[r],
+                u[r + 1],
+                gpp[r],
+                gpq[r],
+                gqq[r],
+                curvature[1],
+                np.float32(hourglass),
+                flux[0],
+                flux[1],
+                above[0],
+                above[1],
+            )
+        for r in range(first, last):
+            if r < rows - 1:
+                _cell_fluxes(
+                    u[r],
+                    u[r + 1],
+                    gpp[r],
+                    gpq[r],
+                    gqq[r],
+                    curvature[1],
+                    np.float32(hourglass),
+                    flux[0],
+                    flux[1],
+                    flux[2],
+                    flux[3],
+                )
+            else:
+                flux[:] = 0.0
+            _second_differences(u[r], bend)
+            _column_weights(r, rows, weights)
+            weights *= curvature[2]
+            _gather_row(
+                u[max(r - 2, 0)],
+                u[max(r - 1, 0)],
+                u[r],
+                u[min(r + 1, rows - 1)],
+                u[min(r + 2, rows - 1)],
+                weights,
+                curvature[0],
+                np.float32(mass),
+                bend,
+                flux[0],
+                flux[1],
+                above[0],
+                above[1],
+                out[r],
+            )
+            above[0] = flux[2]
+            above[1] = flux[3]
+
+
+@njit(cache=True, parallel=True)
+def inverse_diagonal(gpp, gpq, gqq, curvature, hourglass, mass, out):
+    """``out = 1 / diag(A)``; arguments as in `apply_operator`."""
+    rows, cols = out.shape
+    for i in prange(rows):
+        r = np.int64(i)
+        weights = np.zeros(5, np.float32)
+        _column_weights(r, rows, weights)
+        row = out[r]
+        row[:] = np.float32(mass) + curvature[2] * weights[2]
+        _column_diagonal(row, curvature[0])
+        if r < rows - 1:
+            _cell_diagonal(gpp[r], gpq[r], gqq[r], 1.0, curvature[1], hourglass, row)
+        if r > 0:
+            _cell_diagonal(gpp[r - 1], gpq[r - 1], gqq[r - 1], -1.0, curvature[1], hourglass, row)
+        for c in range(cols):
+            row[c] = np.float32(1.0) / max(row[c], np.float32(1e-30))
+
+
+@njit(cache=True, nogil=True)
+def _column_diagonal(row, wxx):
+    weights = np.zeros(5, np.float32)
+    for c in range(row.size):
+        _column_weights(c, row.size, weights)
+        row[c] += wxx * weights[2]
+
+
+@njit(cache=True, nogil=True)
+def _cell_diagonal(gpp, gpq, gqq, sign, twist, hourglass, row):
+    for c in range(gpp.size):
+        trace = gpp[c] + gqq[c]
+        bend = twist + hourglass * trace
+        row[c] += 0.25 * (trace + 2.0 * sign * gpq[c]) + bend
+        row[c + 1] += 0.25 * (trace - 2.0 * sign * gpq[c]) + bend
+
+
+@njit(cache=True, parallel=True)
+def slope_adjoint(gp, gq, out):
+    """``out = D^T (gp, gq)``: the gradient at posts of a cost whose slope gradients are given.
+
+    Parameters
+    ----------
+    gp, gq : float32 array (rows - 1, cols - 1)
+    out : float32 array (rows, cols)
+    """
+    rows, cols = out.shape
+    half = np.float32(0.5)
+    for i in prange(rows):
+        r = np.int64(i)
+        row = out[r]
+        row[:] = 0.0
+        if r < rows - 1:
+            for c in range(cols - 1):
+                row[c] -= half * (gp[r, c] + gq[r, c])
+            for c in range(cols - 1):
+                row[c + 1] += half * (gp[r, c] - gq[r, c])
+        if r > 0:
+            for c in range(cols - 1):
+                row[c] += half * (gq[r - 1, c] - gp[r - 1, c])
+            for c in range(cols - 1):
+                row[c + 1] += half * (gq[r - 1, c] + gp[r - 1, c])
+
+
+def coarse_shape(shape):
+    """Posts of the next coarser grid: every second one, and one beyond an even end."""
+    return shape[0] // 2 + 1, shape[1] // 2 + 1
+
+
+@njit(cache=True, parallel=True)
+def coarsen_cells(fine, coarse):
+    """Mean over 2x2 cells; cells beyond the border count as zero."""
+    rows, cols = fine.shape
+    quarter = np.float32(0.25)
+    for i in prange(coarse.shape[0]):
+        r = np.int64(i)
+        for c in range(coarse.shape[1]):
+            total = np.float32(0.0)
+            for k in range(2 * r, min(2 * r + 2, rows)):
+                for j in range(2 * c, min(2 * c + 2, cols)):
+                    total += fine[k, j]
+            coarse[r, c] = quarter * total
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
+def _halve_row(row, out):
+    """Transpose of linear interpolation along a row: out[c] = row[2c] + (neighbours) / 2."""
+    half = np.float32(0.5)
+    n = row.size
+    out[0] = row[0] + half * row[1]
+    for c in range(1, (n - 1) // 2):
+        out[c] = half * row[2 * c - 1] + row[2 * c] + half * row[2 * c + 1]
+    for c in range(max((n - 1) // 2, 1), out.size):
+        total = half * row[2 * c - 1]
+        if 2 * c < n:
+            total += row[2 * c]
+        if 2 * c + 1 < n:
+            total += half * row[2 * c + 1]
+        out[c] = total
+
+
+@njit(cache=True, parallel=True)
+def restrict(fine, coarse):
+    """Transpose of `prolong`: each coarse post gathers its 3x3 fine posts, weights 1, 1/2, 1/4.
+
+    Parameters
+    ----------
+    fine : float32 array (rows, cols)
+    coarse : float32 array `coarse_shape` (rows, cols)
+    """
+    rows = fine.shape[0]
+    half = np.float32(0.5)
+    for i in prange(coarse.shape[0]):
+        r = np.int64(i)
+        line = np.zeros(fine.shape[1], np.float32)
+        for k in range(max(2 * r - 1, 0), min(2 * r + 2, rows)):
+            weight = np.float32(1.0) if k == 2 * r else half
+            source = fine[k]
+            for c in range(line.size):
+                line[c] += weight * source[c]
+        _halve_row(line, coarse[r])
+
+
+@njit(cache=True, parallel=True)
+def prolong_add(coarse, fine):
+    """Add the bilinear interpolation of coarse posts to the fine ones."""
+    cols = fine.shape[1]
+    half = np.float32(0.5)
+    for i in prange(fine.shape[0]):
+        r = np.int64(i)
+        near, far = coarse[r // 2], coarse[(r + 1) // 2]
+        row = fine[r]
+        for c in range((cols + 1) // 2):
+            row[2 * c] += half * (near[c] + far[c])
+        for c in range(cols // 2):
+            row[2 * c + 1] += half * half * ((near[c] + far[c]) + (near[c + 1] + far[c + 1]))
