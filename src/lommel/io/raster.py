@@ -8,12 +8,13 @@ rasterio lives in this module only. Most callers want `read_on_grid` and `write_
 
 import os
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import rasterio
 import rasterio.shutil
+from affine import Affine
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.errors import NotGeoreferencedWarning, RasterioError, RasterioIOError
 from rasterio.warp import reproject
@@ -190,6 +191,62 @@ def resample(values, source, grid):
         reproject(values, nearest, resampling=Resampling.nearest, **frames)
         result[np.isnan(nearest)] = np.nan
     return result
+
+
+@dataclass(frozen=True)
+class Preview:
+    """A raster made small enough to look at.
+
+    Attributes
+    ----------
+    values : float32 array (rows, cols)
+        Area means of ``shrink`` x ``shrink`` pixels; NaN where nothing is known.
+    grid : Grid
+        Where these means lie.
+    unit : str
+        Of the first band.
+    shrink : float
+        Pixels of the raster per pixel of the preview along a row; 1 when it was small already.
+    """
+
+    values: np.ndarray
+    grid: Grid
+    unit: str
+    shrink: float
+
+
+def read_preview(path, size, body=MOON):
+    """First band of a map-projected raster, shrunk by area means to a longest side in pixels.
+
+    Parameters
+    ----------
+    path : path
+    size : int, pixels
+        A raster whose sides are no longer comes back as it is.
+    body : Body
+
+    Returns
+    -------
+    preview : Preview
+    """
+    grid = read_grid(path, body)
+    shrink = max(1.0, max(grid.shape) / size)
+    shape = tuple(max(1, round(side / shrink)) for side in grid.shape)
+    with _open(path) as file:
+        try:
+            values = file.read(
+                1,
+                out_shape=shape,
+                out_dtype="float32",
+                resampling=Resampling.average,
+                masked=True,
+            ).filled(np.nan)
+        except (RasterioError, ValueError) as error:
+            raise InputError(f"{path} cannot be read, it may be truncated: {error}") from error
+        unit = file.units[0] or ""
+    rows, cols = grid.shape
+    affine = grid.affine @ Affine.scale(cols / shape[1], rows / shape[0])
+    return Preview(values, replace(grid, shape=shape, affine=affine), unit, shrink)
 
 
 def write_raster(path, values, grid, description, unit="", nodata=np.nan):

@@ -1,0 +1,221 @@
+"""What the report shows: one claim after another, each with the pictures that carry it.
+
+A claim is left out when the folder lacks its products. Most callers want `find_claims`.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lommel.report import drawing, plots
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One picture.
+
+    Attributes
+    ----------
+    name : str
+        Of the PNG file beside the products.
+    png : bytes
+    words : str
+        What the picture shows, for those who cannot see it.
+    """
+
+    name: str
+    png: bytes
+    words: str
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A heading, a sentence on how to read it, and its pictures.
+
+    Attributes
+    ----------
+    title, text : str
+    panels : tuple of Panel
+    is_wide : bool
+        The pictures take the page's whole width each.
+    """
+
+    title: str
+    text: str
+    panels: tuple[Panel, ...]
+    is_wide: bool = False
+
+
+def find_claims(contents):
+    """Every claim that the products in a folder support, in reading order.
+
+    Parameters
+    ----------
+    contents : Contents
+
+    Returns
+    -------
+    claims : list of Claim
+    """
+    makers = (
+        albedo_against_mosaic,
+        relief_before_and_after,
+        measured_against_modelled,
+        height_and_change,
+        exposures_of_images,
+        coverage_and_residual,
+        convergence,
+    )
+    claims = (make(contents) for make in makers)
+    return [claim for claim in claims if claim and claim.panels]
+
+
+def albedo_against_mosaic(contents):
+    """Brightness of the plain mosaic and the albedo, each by its own median, on one scale."""
+    before, after = contents.preview("orthomosaic.tif"), contents.preview("albedo.tif")
+    if after is None:
+        return None
+    pair = [_by_median(before), _by_median(after)] if before else [_by_median(after)]
+    limits = drawing.percent_clipped(*[preview.values for preview in pair])
+    titles = ("Before: plain mosaic", "After: albedo")[-len(pair) :]
+    names = ("orthomosaic", "albedo")[-len(pair) :]
+    panels = [
+        _map(preview, name, title, "brightness, median of the map = 1", "gray", limits)
+        for preview, name, title in zip(pair, names, titles, strict=True)
+    ]
+    return Claim(
+        "Albedo without relief and exposure",
+        "Each map is divided by its own median; both have the same grey scale, clipped at 1 and "
+        "99 per cent. In the albedo, slopes and borders of images should be gone and the "
+        "brightness of the ground itself should stay.",
+        tuple(panels),
+        drawing.is_wide(after.grid),
+    )
+
+
+def relief_before_and_after(contents):
+    """Hillshades of the initial and the refined terrain, lit from the image's own Sun."""
+    before = contents.preview("hillshade-before.tif")
+    after = contents.preview("hillshade-after.tif")
+    if after is None:
+        return None
+    pair = [preview for preview in (before, after) if preview]
+    high = drawing.percent_clipped(*[preview.values for preview in pair], high=99.5)[1]
+    titles = ("Before: initial terrain", "After: refined terrain")[-len(pair) :]
+    names = ("hillshade-before", "hillshade-after")[-len(pair) :]
+    panels = [
+        _map(preview, name, title, "hillshade, no unit", "gray", (0.0, high), has_shadow=True)
+        for preview, name, title in zip(pair, names, titles, strict=True)
+    ]
+    return Claim(
+        "Relief that the images show",
+        "Both terrains lit from the Sun of the first image, on the same grey scale. Craters that "
+        "the image shows should appear, stripes and noise of the initial terrain should not.",
+        tuple(panels),
+        drawing.is_wide(after.grid),
+    )
+
+
+def measured_against_modelled(contents):
+    """The image, what the model makes of it, the difference and its distribution."""
+    measured, modelled = contents.preview("measured.tif"), contents.preview("modelled.tif")
+    if measured is None or modelled is None:
+        return None
+    limits = drawing.percent_clipped(measured.values, modelled.values)
+    unit = f"image value{', ' + measured.unit if measured.unit not in ('', '1') else ''}"
+    panels = [
+        _map(measured, "measured", "Measured image", unit, "gray", limits),
+        _map(modelled, "modelled", "Modelled image", unit, "gray", limits, has_shadow=True),
+    ]
+    text = "The same grey scale for both."
+    residual = contents.preview("residual.tif")
+    if residual is not None:
+        panels += _residual_panels(residual)
+        text += (
+            " Residual is modelled minus measured; relief that is left in it is relief the "
+            "terrain does not have."
+        )
+        if residual.shrink > 1:
+            text += f" The histogram counts means of {residual.shrink:.1f} pixels squared."
+    wide = drawing.is_wide(measured.grid)
+    return Claim("How well the terrain explains the image", text, tuple(panels), wide)
+
+
+def height_and_change(contents):
+    """The terrain, and what was added to the initial one."""
+    dem, initial = contents.preview("dem.tif"), contents.preview("initial-dem.tif")
+    if dem is None:
+        return None
+    limits = drawing.percent_clipped(dem.values, low=0.5, high=99.5)
+    panels = [_map(dem, "dem", "Refined terrain", "height, m", "cividis", limits)]
+    text = "Heights in metres above the reference sphere."
+    if initial is not None and initial.values.shape == dem.values.shape:
+        change = replace(dem, values=dem.values - initial.values)
+        both = drawing.about_zero(change.values)
+        title, label = "Refined minus initial", "height change, m"
+        panels.append(_map(change, "height-change", title, label, "RdBu_r", both))
+        text += " The change is drawn symmetrically about zero: red is raised, blue is lowered."
+    return Claim("Heights and what changed", text, tuple(panels), drawing.is_wide(dem.grid))
+
+
+def exposures_of_images(contents):
+    """Exposure and haze of each image along the strip."""
+    exposures = contents.exposures
+    if exposures is None or not (exposures.used & np.isfinite(exposures.exposure)).any():
+        return None
+    words = "Relative exposure of each image with its standard error, and its haze"
+    panel = Panel("exposures", plots.draw_exposures(exposures), words)
+    text = "Brightness factor of each image; bars are standard errors. Haze adds to the image."
+    return Claim("Exposures along the strip", text, (panel,), is_wide=True)
+
+
+def coverage_and_residual(contents):
+    """How many images see each point, and the error of the albedo there."""
+    count = contents.preview("count.tif")
+    panels = []
+    if count is not None:
+        seen = replace(count, values=np.where(count.values > 0, count.values, np.nan))
+        limits = (0.0, max(float(np.nanmax(seen.values, initial=1.0)), 1.0))
+        title, label = "Images per point", "images used at a point"
+        panels.append(_map(seen, "count", title, label, "cividis", limits, whole_numbers=True))
+    residual = contents.preview("residual.tif") if contents.preview("albedo.tif") else None
+    if residual is not None:
+        limits = (0.0, drawing.percent_clipped(residual.values)[1])
+        label = (
+            f"error of the albedo{', ' + residual.unit if residual.unit not in ('', '1') else ''}"
+        )
+        panels.append(_map(residual, "residual", "Error of the albedo", label, "cividis", limits))
+    text = "An albedo is as good as the images that agree on it: many images, small error."
+    wide = bool(panels) and drawing.is_wide((count or residual).grid)
+    return Claim("Where the albedo is well known", text, tuple(panels), wide)
+
+
+def convergence(contents):
+    """Cost of each step of the solver."""
+    png = plots.draw_history(contents.record["history"])
+    if png is None:
+        return None
+    text = "The cost should fall and level off; a run that still falls stopped too early."
+    words = "Cost after each step of the solver"
+    return Claim("Convergence", text, (Panel("convergence", png, words),))
+
+
+def _residual_panels(residual):
+    unit = f"residual{', ' + residual.unit if residual.unit not in ('', '1') else ''}"
+    limits = drawing.about_zero(residual.values)
+    panels = [_map(residual, "residual", "Modelled minus measured", unit, "RdBu_r", limits)]
+    png = plots.draw_histogram(residual.values, unit)
+    if png:
+        panels.append(Panel("residual-histogram", png, f"Histogram of the {unit}"))
+    return panels
+
+
+def _map(preview, name, title, label, colours, limits, has_shadow=False, whole_numbers=False):
+    shadow = preview.values <= 0 if has_shadow else None
+    png = drawing.draw_map(preview, title, label, colours, limits, shadow, whole_numbers)
+    return Panel(name, png, f"{title}: map of {label}")
+
+
+def _by_median(preview):
+    median = np.nanmedian(preview.values) if np.isfinite(preview.values).any() else 1.0
+    return replace(preview, values=preview.values / (median or 1.0))
