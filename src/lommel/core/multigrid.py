@@ -160,7 +160,7 @@ class LinearSolution:
     reduction: float
 
 
-def conjugate_gradients(equations, right_hand_side, tolerance, maxiterations):
+def conjugate_gradients(equations, right_hand_side, tolerance, max_iterations):
     """Solve ``A x = right_hand_side`` from zero.
 
     Parameters
@@ -169,7 +169,7 @@ def conjugate_gradients(equations, right_hand_side, tolerance, maxiterations):
     right_hand_side : float32 array (rows, cols)
     tolerance : float
         Reduction of sqrt(residual . preconditioned residual) to stop at.
-    maxiterations : int
+    max_iterations : int
 
     Returns
     -------
@@ -183,7 +183,8 @@ def conjugate_gradients(equations, right_hand_side, tolerance, maxiterations):
     energy = start = dot(residual, preconditioned)
     if not start > 0:
         return LinearSolution(x, 0, 0.0)
-    for iteration in range(1, maxiterations + 1):
+    iterations = 0
+    while iterations < max_iterations:
         equations.apply(direction, image)
         bending = dot(direction, image)
         if not bending > 0:
