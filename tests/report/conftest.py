@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lommel.io.raster import write_raster
+from lommel.report import write_report
 from lommel.scene.grid import grid_from_bounds, read_crs
 
 HOSTILE_NAME = '<img src=x onerror="alert(1)"> $a_b$ & co.tif'
@@ -49,10 +50,7 @@ def _record(folder, **parts):
     (folder / "run.json").write_text(json.dumps(content), encoding="utf-8")
 
 
-@pytest.fixture
-def albedo_folder(tmp_path):
-    """Products of `lommel albedo` on a strip in degrees, with a border and a hole without data."""
-    folder = tmp_path / "albedo"
+def _write_albedo_products(folder):
     folder.mkdir()
     grid = grid_from_bounds((20.0, -12.0, 32.0, -8.0), 2000.0, read_crs("IAU_2015:30100"))
     relief = _relief(grid, 1)
@@ -86,13 +84,9 @@ def albedo_folder(tmp_path):
         results={"exposure_rms_percent": 0.4321, "albedo_error_percent": 2.7, "images": 24},
         skipped=[{"image": HOSTILE_NAME, "reason": "does not overlap the DEM <b>at all</b>."}],
     )
-    return folder
 
 
-@pytest.fixture
-def sfs_folder(tmp_path):
-    """Products of `lommel sfs` on a square in metres."""
-    folder = tmp_path / "sfs"
+def _write_terrain_products(folder):
     folder.mkdir()
     crs = read_crs("+proj=stere +lat_0=26 +lon_0=3 +R=1737400 +units=m")
     grid = grid_from_bounds((-2500.0, -2500.0, 2500.0, 2500.0), 40.0, crs)
@@ -114,17 +108,33 @@ def sfs_folder(tmp_path):
     ):
         write_raster(folder / f"{name}.tif", values, grid, name, unit)
     _record(folder, command="sfs", results={"height_rmse_m": 0.137, "correlation_after": 0.952})
-    return folder
 
 
 @pytest.fixture
-def demo_folder(albedo_folder, sfs_folder, tmp_path):
-    """A run that holds two stages and compares them with the truth."""
+def albedo_folder(tmp_path):
+    """Products of `lommel albedo` on a strip in degrees, with a border and a hole without data."""
+    _write_albedo_products(tmp_path / "albedo")
+    return tmp_path / "albedo"
+
+
+@pytest.fixture
+def sfs_folder(tmp_path):
+    """Products of `lommel sfs` on a square in metres."""
+    _write_terrain_products(tmp_path / "sfs")
+    return tmp_path / "sfs"
+
+
+@pytest.fixture(scope="session")
+def demo_report(tmp_path_factory):
+    """The page of a run that holds two stages and compares them with the truth."""
+    folder = tmp_path_factory.mktemp("demo")
+    _write_albedo_products(folder / "albedo")
+    _write_terrain_products(folder / "sfs")
     _record(
-        tmp_path,
+        folder,
         command="demo",
         results={"exposure_rms_percent": 0.5, "albedo_rms_percent": 2.1, "height_rmse_m": 8.25},
         targets={"exposure_rms_percent": "at most 1", "albedo_rms_percent": "at most 3"},
         history=[],
     )
-    return tmp_path
+    return write_report(folder)
