@@ -249,7 +249,7 @@ def read_preview(path, size, body=MOON):
     return Preview(values, replace(grid, shape=shape, affine=affine), unit, shrink)
 
 
-def write_raster(path, values, grid, description, unit="", nodata=np.nan):
+def write_raster(path, values, grid, description, unit="", nodata=np.nan, valid=None):
     """One band as a Cloud-Optimized GeoTIFF; it appears whole or not at all.
 
     Parameters
@@ -261,6 +261,8 @@ def write_raster(path, values, grid, description, unit="", nodata=np.nan):
     description, unit : str
         Band description and unit, as GIS programs show them.
     nodata : float
+    valid : bool array (rows, cols), optional
+        For 8-bit values, which have no NaN: stored as a mask in a second band.
     """
     path = Path(path)
     values = np.asarray(values)
@@ -272,7 +274,7 @@ def write_raster(path, values, grid, description, unit="", nodata=np.nan):
         "driver": "GTiff",
         "height": grid.shape[0],
         "width": grid.shape[1],
-        "count": 1,
+        "count": 1 if valid is None else 2,
         "dtype": values.dtype,
         "crs": grid.crs.to_wkt(),
         "transform": grid.affine,
@@ -285,6 +287,9 @@ def write_raster(path, values, grid, description, unit="", nodata=np.nan):
                 file.write(values, 1)
                 file.set_band_description(1, description)
                 file.set_band_unit(1, unit)
+                if valid is not None:
+                    file.write(np.where(valid, 255, 0).astype(values.dtype), 2)
+                    file.set_band_description(2, "mask")
             with memory.open() as file:
                 rasterio.shutil.copy(
                     file,
