@@ -31,7 +31,7 @@ def surface_of(heights, albedo=None, oversampling=2):
 
 def image_of(surface, lit=None):
     lit = np.ones(surface.albedo.shape) if lit is None else lit
-    return reflected(surface, surface.grid.window, lit, SUN, CAMERA, MODEL)
+    return surface.mean(reflected(surface, lit, SUN, CAMERA, MODEL))
 
 
 def test_flat_ground_reflects_as_the_model_says():

@@ -1,8 +1,9 @@
 """Images of the ground: light on facets finer than the posts, averaged over each post's area.
 
 Each post stands for a square of ground. The square is cut into facets between vertices of a finer
-lattice; every facet reflects light by its own normal, albedo and shadow, and the image value is
-their mean. The estimators see posts only, so simulated data do not share their discretisation.
+lattice; every facet reflects light by its own normal, albedo and shadow, and image values are
+means over facets. The estimators see posts only, so simulated data do not share their
+discretisation. `lommel.simulate.projection` says which facets an image shows where.
 Most callers want `build_surface` and `reflected`.
 """
 
@@ -51,6 +52,25 @@ class Surface:
         """Heights of the posts, m."""
         half = self.oversampling // 2
         return self.vertices[half :: self.oversampling, half :: self.oversampling].copy()
+
+    def facets_of(self, window):
+        """Index of the facets that belong to a window of posts."""
+        numbers = (self.oversampling * n for n in (window.row, window.col, *window.shape))
+        return Window(*numbers).slices
+
+    def cut(self, window):
+        """The part of this surface that belongs to a window of posts."""
+        part, grid = self.facets_of(window), self.grid.cut(window)
+        corners = tuple(slice(side.start, side.stop + 1) for side in part)
+        return Surface(
+            grid,
+            self.oversampling,
+            vertex_lattice(grid, self.oversampling),
+            self.vertices[corners],
+            self.facets[part],
+            self.normals[part],
+            self.albedo[part],
+        )
 
     def mean(self, values):
         """Means over the facets of each post, array (rows, cols)."""
@@ -178,14 +198,12 @@ def lit_share(surface, sun_position):
     return _corner_mean(is_lit.astype(np.float64))
 
 
-def reflected(surface, window, lit, sun_position, spacecraft_position, model):
-    """Albedo times reflectance, averaged over each post's area.
+def reflected(surface, lit, sun_position, spacecraft_position, model):
+    """Albedo times reflectance of each facet.
 
     Parameters
     ----------
     surface : Surface
-    window : Window
-        The posts wanted.
     lit : array (facet rows, facet cols), 0 to 1
         From `lit_share`.
     sun_position, spacecraft_position : array (3,), m, body-fixed
@@ -193,15 +211,11 @@ def reflected(surface, window, lit, sun_position, spacecraft_position, model):
 
     Returns
     -------
-    brightness : array (window.rows, window.cols), dimensionless
+    brightness : array (facet rows, facet cols), dimensionless
     """
-    factor = surface.oversampling
-    part = Window(*(factor * number for number in (window.row, window.col, *window.shape))).slices
-    geometry = viewing_geometry(
-        surface.facets[part], surface.normals[part], sun_position, spacecraft_position
-    )
+    geometry = viewing_geometry(surface.facets, surface.normals, sun_position, spacecraft_position)
     reflectance = model.reflectance(geometry.cos_incidence, geometry.cos_emission, geometry.phase)
-    return surface.mean(surface.albedo[part] * lit[part] * reflectance)
+    return surface.albedo * lit * reflectance
 
 
 def seen_window(camera, xyz):

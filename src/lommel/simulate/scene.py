@@ -23,6 +23,7 @@ from lommel.simulate.imaging import (
     seen_window,
 )
 from lommel.simulate.orbit import frame_cameras, sun_position
+from lommel.simulate.projection import orthoimage
 from lommel.simulate.terrain import DEM_ERROR, spline_noise
 
 LEAST_MARGIN = 10  # posts around the grid, so that shadows fall in from outside
@@ -85,7 +86,8 @@ def simulate_scene(settings, progress=iter):
     margin = max(LEAST_MARGIN, int(np.ceil(BLUR_REACH * settings.initial_dem.blur / spacing)))
     surface = build_surface(settings, margin)
     inside = Window(margin, margin, settings.grid.rows, settings.grid.cols)
-    images = _take_images(settings, surface, inside, progress)
+    initial = _stereo_heights(settings, surface, inside)
+    images = _take_images(settings, surface, inside, initial, progress)
     if not images:
         raise InputError(
             "No frame of the orbit sees the grid. Move grid.east and grid.north towards 0, or "
@@ -94,45 +96,60 @@ def simulate_scene(settings, progress=iter):
     return Scene(
         grid=map_grid(settings.grid),
         heights=surface.heights[inside.slices],
-        initial_heights=_stereo_heights(settings, surface, inside),
+        initial_heights=initial,
         albedo=surface.mean(surface.albedo)[inside.slices],
         images=tuple(images),
     )
 
 
-def _take_images(settings, surface, inside, progress):
+def _take_images(settings, surface, inside, initial, progress):
     model = reflectance_model(settings.reflectance)
     cameras = frame_cameras(settings.orbit, settings.grid)
-    posts = surface.grid.cut(inside).xyz(surface.heights[inside.slices])
+    posts = surface.grid.cut(inside).xyz(initial)
     suns = [sun_position(sun) for sun in settings.suns]
     lit = [lit_share(surface, sun) for sun in suns]
     images = []
     for revolution, frame in progress(list(np.ndindex(len(suns), len(cameras)))):
-        camera = cameras[frame]
+        camera, sun = cameras[frame], suns[revolution]
         window, is_seen = seen_window(camera, posts)
         if window.is_empty:
             continue
+        around = _widen(window, inside)
+        part = surface.cut(around)
+        light = lit[revolution][surface.facets_of(around)]
+        brightness = orthoimage(
+            part,
+            reflected(part, light, sun, camera.position, model),
+            initial[window.slices],
+            Window(inside.row, inside.col, *window.shape),
+            camera.position,
+        )
         # the frame's own stream: what it records does not depend on which frames see the grid
         random = np.random.default_rng([settings.seed, revolution, frame])
-        exposure = settings.film.exposure * (
-            1.0 + settings.film.exposure_spread * random.uniform(-1.0, 1.0)
-        )
-        haze = settings.film.haze * random.uniform()
-        there = Window(inside.row + window.row, inside.col + window.col, *window.shape)
-        brightness = reflected(
-            surface, there, lit[revolution], suns[revolution], camera.position, model
-        )
+        exposure, haze = _exposure_and_haze(settings.film, random)
         measured = record(brightness, exposure, haze, settings.film, random)
         observation = Observation(
             name=f"orbit{revolution + 1}-frame{frame + 1:02d}.tif",
             window=window,
             measured=np.where(is_seen, measured, np.float32(np.nan)),
-            sun_position=suns[revolution],
+            sun_position=sun,
             spacecraft_position=camera.position,
             saturation=255.0 if settings.film.bits == 8 else np.inf,
         )
         images.append(SimulatedImage(observation, camera, exposure, haze))
     return images
+
+
+def _widen(window, inside):
+    """A window of the scene's posts with the margin around it, on the surface's grid."""
+    return Window(
+        window.row, window.col, window.rows + 2 * inside.row, window.cols + 2 * inside.col
+    )
+
+
+def _exposure_and_haze(film, random):
+    exposure = film.exposure * (1.0 + film.exposure_spread * random.uniform(-1.0, 1.0))
+    return exposure, film.haze * random.uniform()
 
 
 def _stereo_heights(settings, surface, inside):
