@@ -1,9 +1,9 @@
 r"""Conjugate gradients, preconditioned by one V-cycle, for the normal operator.
 
-The operator of `lommel.core.normal_operator` is completed by a term that pulls long wavelengths
-only: with `S` the repeated normalised restriction down to a coarse level,
+The operator of `lommel.core.normal_operator` is completed by terms that pull long wavelengths
+only: with :math:`S_l` the normalised restriction repeated `l` times,
 
-.. math:: A = D^T G D + K^T W K + S^T m S .
+.. math:: A = D^T G D + K^T W K + \sum_l m_l S_l^T S_l .
 
 Coarse levels carry the 2x2 mean of the tensors, a quarter of the curvature weight and four times
 the mass per level (the same energy for the same smooth surface), and resist the twist that
@@ -70,16 +70,14 @@ class NormalEquations:
         Gpp, Gpq, Gqq per squared difference.
     curvature : float32 array (3,)
         Weights of the second differences along rows, of the twist, and along columns.
-    mass : float
-        Weight of each post of level ``mass_level`` in the long-wavelength term.
-    mass_level : int
-        How often the grid is halved before the mass acts; 0 makes it act on every post.
+    masses : array (depth,)
+        Weight of each post of the grid halved 0, 1, 2, ... times.
     """
 
-    def __init__(self, tensors, curvature, mass, mass_level):
+    def __init__(self, tensors, curvature, masses):
         rows, cols = tensors[0].shape
-        self.mass, self.mass_level = mass, mass_level
-        self.levels = [_level((rows + 1, cols + 1), tensors, curvature, 0.0, mass, mass_level)]
+        self.masses = np.asarray(masses, float)
+        self.levels = [_level((rows + 1, cols + 1), tensors, curvature, 0.0, self.masses[0])]
         while min(self.levels[-1].shape) > SMALLEST:
             finer = self.levels[-1]
             shape = coarse_shape(finer.shape)
@@ -87,9 +85,9 @@ class NormalEquations:
             with threads_for(finer.shape):
                 for fine, half in zip(finer.tensors, coarse, strict=True):
                     coarsen_cells(fine, half)
-            depth = mass_level - len(self.levels)
             weights = finer.curvature / np.float32(4)
-            self.levels.append(_level(shape, coarse, weights, HOURGLASS, mass, depth))
+            mass = coarse_masses(self.masses, len(self.levels))[0]
+            self.levels.append(_level(shape, coarse, weights, HOURGLASS, mass))
         self._inverse = _dense_inverse(self.levels[-1])
 
     @property
@@ -102,11 +100,8 @@ class NormalEquations:
         finest = self.levels[0]
         with threads_for(u.shape):
             finest.apply(u, out)
-        depth = min(self.mass_level, len(self.levels) - 1)
-        if self.mass > 0 and depth > 0:
-            low = long_waves(u, depth)
-            low *= np.float32(_scaled_mass(self.mass, self.mass_level - depth))
-            add_long_waves(low, out, depth)
+        if self.masses[1:].any():
+            add_long_waves(u, np.concatenate([[0.0], self.masses[1:]]), out)
 
     def precondition(self, right_hand_side):
         """One V-cycle from zero.
@@ -203,41 +198,43 @@ def conjugate_gradients(equations, right_hand_side, tolerance, max_iterations):
     return LinearSolution(x, iterations, float(np.sqrt(max(energy, 0.0) / start)))
 
 
-def long_waves(u, depth):
-    """The long wavelengths of ``u``: ``depth`` times restricted, weights normalised to one.
+def add_long_waves(u, masses, out):
+    """Add the long-wavelength terms to a gradient.
 
     Parameters
     ----------
     u : float32 array (rows, cols)
-    depth : int, at least 1
+    masses : array (depth,)
+        Weight of each post of the grid halved 0, 1, 2, ... times.
+    out : float32 array (rows, cols)
+        Gets the sum of m_l S_l^T S_l u added.
 
     Returns
     -------
-    low : float32 array, the shape of ``u`` halved ``depth`` times
+    energy : float
+        The sum of m_l |S_l u|^2.
     """
-    for _ in range(depth):
-        low = np.empty(coarse_shape(u.shape), np.float32)
-        with threads_for(u.shape):
-            restrict(u, low)
+    lows = [u]
+    for _ in masses[1:]:
+        low = np.empty(coarse_shape(lows[-1].shape), np.float32)
+        with threads_for(lows[-1].shape):
+            restrict(lows[-1], low)
         low *= np.float32(0.25)  # the nine weights of `restrict` sum to four
-        u = low
-    return u
-
-
-def add_long_waves(low, out, depth):
-    """Add the transpose of `long_waves` applied to ``low``."""
-    shapes = [out.shape]
-    for _ in range(depth):
-        shapes.append(coarse_shape(shapes[-1]))
-    for shape in shapes[-2:0:-1]:
-        finer = np.zeros(shape, np.float32)
-        with threads_for(shape):
-            prolong_add(low, finer)
-        finer *= np.float32(0.25)
-        low = finer
-    low = low * np.float32(0.25)
-    with threads_for(out.shape):
-        prolong_add(low, out)
+        lows.append(low)
+    energy = sum(mass * dot(low, low) for mass, low in zip(masses, lows, strict=True) if mass)
+    total = None
+    for mass, low in zip(masses[:0:-1], lows[:0:-1], strict=True):
+        own = np.float32(mass) * low
+        if total is not None:
+            with threads_for(own.shape):
+                prolong_add(total, own)
+        total = np.float32(0.25) * own
+    if total is not None:
+        with threads_for(out.shape):
+            prolong_add(total, out)
+    if masses[0]:
+        out += np.float32(masses[0]) * u
+    return energy
 
 
 @contextmanager
@@ -279,14 +276,13 @@ def _row_dot(a, b):
     return total
 
 
-def _level(shape, tensors, curvature, hourglass, mass, depth):
-    """Coefficients and work arrays of a grid that lies ``depth`` levels above the mass."""
-    own_mass = _scaled_mass(mass, depth) if depth <= 0 else 0.0
+def _level(shape, tensors, curvature, hourglass, mass):
+    """Coefficients and work arrays of a grid."""
     level = Level(
         tensors,
         curvature.astype(np.float32),
         np.float32(hourglass),
-        np.float32(own_mass),
+        np.float32(mass),
         *(np.zeros(shape, np.float32) for _ in range(5)),
     )
     with threads_for(shape):
@@ -296,9 +292,12 @@ def _level(shape, tensors, curvature, hourglass, mass, depth):
     return level
 
 
-def _scaled_mass(mass, depth):
-    """The mass of a post of a grid that lies ``-depth`` levels below the one it was given for."""
-    return mass * 4.0 ** (-depth)
+def coarse_masses(masses, halvings):
+    """Masses of the grid halved so often; those of finer grids act on its posts, times 4 each."""
+    masses = np.asarray(masses, float)
+    factors = 4.0 ** (halvings - np.arange(min(halvings + 1, masses.size)))
+    own = (masses[: factors.size] * factors).sum()
+    return np.concatenate([[own], masses[halvings + 1 :]])
 
 
 def _dense_inverse(level):

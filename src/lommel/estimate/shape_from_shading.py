@@ -23,9 +23,9 @@ from lommel.core.least_squares import Solution
 from lommel.core.multigrid import (
     NormalEquations,
     add_long_waves,
+    coarse_masses,
     conjugate_gradients,
     dot,
-    long_waves,
     threads_for,
 )
 from lommel.core.normal_operator import (
@@ -35,6 +35,7 @@ from lommel.core.normal_operator import (
     restrict,
     slope_adjoint,
 )
+from lommel.estimate.priors import estimate_priors
 from lommel.estimate.shading_kernels import (
     SUM_COST,
     SUM_FF,
@@ -46,29 +47,8 @@ from lommel.estimate.shading_kernels import (
 
 COARSEST = 24  # posts along the shorter side of the coarsest level that sees the images
 COARSE_STEPS = 2  # Gauss-Newton steps per coarse level
+SLOPE_STEP = 0.01  # for the change of brightness with slope: R bends little over half a degree
 HUBER_SCALE = 3.0  # noise standard errors from which a residual counts as an outlier
-
-
-@dataclass(frozen=True)
-class Priors:
-    """What is expected before the images are seen.
-
-    Attributes
-    ----------
-    noise : float, share of the image's median brightness
-        Standard error of a measured value, model errors included.
-    roughness : float, rad
-        Standard deviation of the change of slope from post to post.
-    dem_error : float, m
-        Standard error of the initial DEM, averaged over `dem_resolution`.
-    dem_resolution : float, m
-        Wavelengths shorter than twice this are not held by the initial DEM.
-    """
-
-    noise: float
-    roughness: float
-    dem_error: float
-    dem_resolution: float
 
 
 @dataclass(frozen=True)
@@ -111,8 +91,7 @@ class Problem:
     cells: list
     albedo: np.ndarray
     curvature: np.ndarray
-    mass: float
-    mass_level: int
+    masses: np.ndarray
     geometry: list = field(default_factory=list)
 
     def prepare_geometry(self, u):
@@ -159,6 +138,49 @@ class Problem:
                 )
         return tensors, gradient, sums
 
+    def predict(self, u, k):
+        """Modelled image ``k`` on the cells."""
+        lattice, _, _, gram, lights = self.geometry
+        out = np.empty((u.shape[0] - 1, u.shape[1] - 1), np.float32)
+        spacing = np.array(self.surface.grid.spacing, np.float32) * self.stride
+        image = np.array([self.exposures[k], self.hazes[k]], np.float32)
+        with threads_for(u.shape):
+            predict(
+                u,
+                gram,
+                lights[k],
+                lattice.step,
+                spacing,
+                self.model.kind,
+                self.model.parameter_array(),
+                self.albedo,
+                image,
+                out,
+            )
+        return out
+
+    def mean_gain(self, u, k):
+        """Mean change of image ``k`` with the slopes along columns and rows, image units."""
+        flat = np.zeros_like(u)
+        tilt = np.float32(SLOPE_STEP)
+        centre = self.predict(flat, k)
+        gains = []
+        for axis, spacing in ((1, self.surface.grid.spacing[1]), (0, self.surface.grid.spacing[0])):
+            shape = [1, 1]
+            shape[axis] = u.shape[axis]
+            ramp = tilt * np.float32(spacing) * np.arange(u.shape[axis], dtype=np.float32)
+            change = self.predict(np.ascontiguousarray(flat + ramp.reshape(shape)), k) - centre
+            gains.append(float(change.mean() / tilt))
+        return gains
+
+    def expect(self, priors):
+        """Take over priors: image weights, curvature weights and masses."""
+        s_row, s_col = self.surface.grid.spacing
+        self.weights = np.asarray(priors.noise, float) ** -2.0
+        weights = np.array([1 / s_col**2, 2 / (s_row * s_col), 1 / s_row**2])
+        self.curvature = (weights / priors.roughness**2).astype(np.float32)
+        self.masses = np.asarray(priors.masses, float)
+
     def prior_gradient(self, u):
         """Gradient of the prior terms at ``u``, and their cost."""
         none = np.zeros((u.shape[0] - 1, u.shape[1] - 1), np.float32)
@@ -166,14 +188,7 @@ class Problem:
         with threads_for(u.shape):
             apply_operator(u, none, none, none, self.curvature, 0.0, 0.0, out)
         cost = dot(u, out) / 2
-        change = u - self.initial
-        low = long_waves(change, self.mass_level) if self.mass_level else change
-        cost += 0.5 * self.mass * float(np.vdot(low, low))
-        low = np.float32(self.mass) * low
-        if self.mass_level:
-            add_long_waves(low, out, self.mass_level)
-        else:
-            out += low
+        cost += add_long_waves(u - self.initial, self.masses, out) / 2
         return out, cost
 
 
@@ -257,7 +272,7 @@ def coarse_posts(posts):
     return total / weight
 
 
-def solve_surface(surface, initial, views, model, priors, settings=None, albedo=None):
+def solve_surface(surface, initial, views, model, priors=None, settings=None, albedo=None):
     """Refine a surface by the shading in images.
 
     Parameters
@@ -267,7 +282,8 @@ def solve_surface(surface, initial, views, model, priors, settings=None, albedo=
         Unknowns of the initial DEM at the posts; no holes.
     views : list of OrthoView or CameraView
     model : ReflectanceModel
-    priors : Priors
+    priors : Priors, optional
+        Estimated from images and initial DEM by default.
     settings : SolverSettings, optional
     albedo : float32 array (rows - 1, cols - 1), optional
         Known albedo on the cells; 1 by default.
@@ -278,10 +294,13 @@ def solve_surface(surface, initial, views, model, priors, settings=None, albedo=
         Its value is a `SurfaceSolution`.
     """
     settings = settings or SolverSettings()
-    finest = _finest_problem(surface, initial, views, model, priors, albedo)
-    finest.prepare_geometry(initial)
-    _sample_images(finest, initial)
-    _fit_exposures(finest, initial, priors.noise)
+    finest = _finest_problem(surface, initial, views, model, albedo)
+    finest.prepare_geometry(finest.initial)
+    _sample_images(finest, finest.initial)
+    _fit_exposures(finest)
+    if priors is None:
+        priors = _estimate_priors(finest)
+    finest.expect(priors)
     levels = [finest]
     while min(levels[-1].initial.shape) >= 2 * COARSEST:
         levels.append(_coarser(levels[-1]))
@@ -313,7 +332,7 @@ def _descend(level, u, steps, settings, history):
         with threads_for(u.shape):
             slope_adjoint(gradient[0], gradient[1], right)
         right = -(right + prior)
-        equations = NormalEquations(tuple(tensors), level.curvature, level.mass, level.mass_level)
+        equations = NormalEquations(tuple(tensors), level.curvature, level.masses)
         linear = conjugate_gradients(
             equations, right, settings.cycle_tolerance, settings.max_cycles
         )
@@ -355,13 +374,9 @@ def _best_exposures(sums, exposures):
     return np.where(has_data, sums[:, SUM_FM] / np.where(has_data, sums[:, SUM_FF], 1), exposures)
 
 
-def _finest_problem(surface, initial, views, model, priors, albedo):
+def _finest_problem(surface, initial, views, model, albedo):
     rows, cols = initial.shape
-    s_row, s_col = surface.grid.spacing
     count = len(views)
-    curvature = np.array([1 / s_col**2, 2 / (s_row * s_col), 1 / s_row**2]) / priors.roughness**2
-    spacing = (s_row * s_col) ** 0.5
-    level = max(int(round(np.log2(max(priors.dem_resolution / spacing, 1.0)))), 0)
     if albedo is None:
         albedo = np.ones((rows - 1, cols - 1), np.float32)
     return Problem(
@@ -375,14 +390,12 @@ def _finest_problem(surface, initial, views, model, priors, albedo):
         np.ascontiguousarray(initial, np.float32),
         [np.empty((rows - 1, cols - 1), np.float32) for _ in views],
         albedo,
-        curvature.astype(np.float32),
-        priors.dem_error**-2.0,
-        level,
+        np.zeros(3, np.float32),
+        np.zeros(1),
     )
 
 
 def _coarser(finer):
-    depth = finer.mass_level - 1
     coarse = replace(
         finer,
         exposures=finer.exposures.copy(),
@@ -391,8 +404,7 @@ def _coarser(finer):
         cells=[coarse_cells(cells) for cells in finer.cells],
         albedo=np.nan_to_num(coarse_cells(finer.albedo), nan=1.0),
         curvature=finer.curvature / 4,
-        mass=finer.mass if depth >= 0 else 4 * finer.mass,
-        mass_level=max(depth, 0),
+        masses=coarse_masses(finer.masses, 1),
     )
     coarse.prepare_geometry(coarse.initial)
     return coarse
@@ -409,35 +421,26 @@ def _sample_images(level, u):
             sample_cells(view.image, planes, lattice.step, u, surface_of_image, cells)
 
 
-def _fit_exposures(level, u, noise):
-    """Exposures that match the initial DEM, then weights from them."""
-    for _ in range(2):
-        _, _, sums = level.assemble(u)
-        level.exposures[:] = _best_exposures(sums, level.exposures)
-        typical = [np.nanmedian(cells[::4, ::4]) for cells in level.cells]
-        level.weights[:] = 1 / (noise * np.maximum(np.nan_to_num(typical), 1e-6)) ** 2
+def _fit_exposures(level):
+    """Exposures that match the initial surface."""
+    _, _, sums = level.assemble(level.initial)
+    level.exposures[:] = _best_exposures(sums, level.exposures)
+
+
+def _estimate_priors(level):
+    images = range(len(level.views))
+    modelled = [level.predict(level.initial, k) for k in images]
+    residuals = [cells - model for cells, model in zip(level.cells, modelled, strict=True)]
+    gains = [level.mean_gain(level.initial, k) for k in images]
+
+    def respond(relief, k):
+        return level.predict(level.initial + relief, k) - modelled[k]
+
+    return estimate_priors(level.cells, residuals, gains, level.surface.grid.spacing, respond)
 
 
 def _result(level, u):
-    lattice, _, _, gram, lights = level.geometry
-    spacing = np.array(level.surface.grid.spacing, np.float32)
-    modelled = []
-    for k, light in enumerate(lights):
-        out = np.empty((u.shape[0] - 1, u.shape[1] - 1), np.float32)
-        image = np.array([level.exposures[k], level.hazes[k]], np.float32)
-        predict(
-            u,
-            gram,
-            light,
-            lattice.step,
-            spacing,
-            level.model.kind,
-            level.model.parameter_array(),
-            level.albedo,
-            image,
-            out,
-        )
-        modelled.append(out)
+    modelled = [level.predict(u, k) for k in range(len(level.views))]
     return SurfaceSolution(u, level.exposures, level.hazes, modelled, level.cells)
 
 
