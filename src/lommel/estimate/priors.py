@@ -24,9 +24,8 @@ ROUGHNESS_OCTAVES = slice(1, 4)  # the shortest octave is dulled by the pixels' 
 # Photometric models and calibrations err at long waves, where a small error of brightness is a
 # large one of height: this share of the brightness is doubted in every octave.
 PHOTOMETRIC_ERROR = 0.0005
-BEND_MARGIN = 8.0  # craters bend more light than random relief of the same spectrum: up to this much
-    2.0  # a spectrum of random relief differs from the real one's by a factor of this size
-)
+# Craters bend more light than random relief of the same spectrum: up to this factor
+BEND_MARGIN = 8.0
 
 
 @dataclass(frozen=True)
