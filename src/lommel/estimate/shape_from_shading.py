@@ -35,7 +35,7 @@ from lommel.core.normal_operator import (
     restrict,
     slope_adjoint,
 )
-from lommel.estimate.priors import estimate_priors
+from lommel.estimate.priors import Priors, estimate_priors
 from lommel.estimate.shading_kernels import (
     SUM_COST,
     SUM_FF,
@@ -201,16 +201,21 @@ class SurfaceSolution:
     u : float32 array (rows, cols), m
         Unknowns of the surface at the posts.
     exposures, hazes : array (images,)
-    modelled, measured : list of float32 array (rows - 1, cols - 1)
-        On the cells of the refined surface; NaN where not used.
-    history : list of dict
+    measured : list of float32 array (rows - 1, cols - 1), image units
+        Images on the cells of the refined surface; NaN where not used.
+    modelled, started : list of float32 array (rows - 1, cols - 1), image units
+        What the refined and the initial surface predict there.
+    priors : Priors
+        As estimated or given.
     """
 
     u: np.ndarray
     exposures: np.ndarray
     hazes: np.ndarray
-    modelled: list
     measured: list
+    modelled: list
+    started: list
+    priors: Priors
 
 
 def light_planes(frame, view, model):
@@ -301,6 +306,7 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
     if priors is None:
         priors = _estimate_priors(finest)
     finest.expect(priors)
+    started = [finest.predict(finest.initial, k) for k in range(len(views))]
     levels = [finest]
     while min(levels[-1].initial.shape) >= 2 * COARSEST:
         levels.append(_coarser(levels[-1]))
@@ -317,7 +323,11 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
         u, converged = _descend(level, u, steps, settings, history)
         correction, exposures = u - level.initial, level.exposures.copy()
     outcome, advice = _outcome(converged, history)
-    return Solution(_result(finest, u), outcome, advice, history)
+    modelled = [finest.predict(u, k) for k in range(len(views))]
+    value = SurfaceSolution(
+        u, finest.exposures, finest.hazes, finest.cells, modelled, started, priors
+    )
+    return Solution(value, outcome, advice, history)
 
 
 def _descend(level, u, steps, settings, history):
@@ -439,9 +449,31 @@ def _estimate_priors(level):
     return estimate_priors(level.cells, residuals, gains, level.surface.grid.spacing, respond)
 
 
-def _result(level, u):
-    modelled = [level.predict(u, k) for k in range(len(level.views))]
-    return SurfaceSolution(u, level.exposures, level.hazes, modelled, level.cells)
+def fill_holes(heights):
+    """Heights with holes filled smoothly from their surroundings, coarse to fine.
+
+    Parameters
+    ----------
+    heights : float32 array (rows, cols), m; NaN in holes
+
+    Returns
+    -------
+    heights : float32 array (rows, cols), m
+    """
+    known = np.isfinite(heights)
+    if known.all():
+        return heights
+    if min(heights.shape) <= 2:
+        return np.where(known, heights, np.nanmean(heights)).astype(np.float32)
+    total = np.zeros(coarse_shape(heights.shape), np.float32)
+    weight = np.zeros_like(total)
+    restrict(np.where(known, heights, np.float32(0)).astype(np.float32), total)
+    restrict(known.astype(np.float32), weight)
+    with np.errstate(invalid="ignore"):
+        coarse = fill_holes(np.where(weight > 0, total / weight, np.float32(np.nan)))
+    filled = np.zeros_like(heights)
+    prolong_add(coarse, filled)
+    return np.where(known, heights, filled)
 
 
 def _outcome(converged, history):

@@ -1,0 +1,246 @@
+"""The stage `lommel sfs`: images, positions and a DEM in, a refined DEM out.
+
+Most callers want `run_shape_from_shading`.
+"""
+
+import csv
+from dataclasses import asdict, dataclass, field, replace
+
+import numpy as np
+from affine import Affine
+
+from lommel.core.reflectance import reflectance_model
+from lommel.errors import InputError
+from lommel.estimate.shape_from_shading import SolverSettings, fill_holes, solve_surface
+from lommel.estimate.surface import Surface
+from lommel.io.raster import write_raster
+from lommel.run.inputs import GridSettings, SceneFiles, Skipped, read_scene
+from lommel.run.products import RunRecord, output_folder
+from lommel.scene.geometry import surface_normals, viewing_geometry
+from lommel.scene.grid import Grid
+from lommel.scene.masks import MaskSettings, shadow_thresholds
+from lommel.scene.view import OrthoView
+
+PARAMETRISATIONS = ("height", "ray")
+LEAST_LIT = 0.01  # share of an image's pixels that must be lit and unclipped for it to be used
+
+
+@dataclass(frozen=True)
+class SfsSettings:
+    """What `lommel sfs` can be told; the defaults need no telling.
+
+    Attributes
+    ----------
+    parametrisation : {'height', 'ray'}
+        Along the local vertical, or along the view rays of the first image.
+    reflectance : str
+        Name of a reflectance model.
+    solver : SolverSettings
+    masks : MaskSettings
+    """
+
+    parametrisation: str = "height"
+    reflectance: str = "lunar-lambert"
+    solver: SolverSettings = field(default_factory=SolverSettings)
+    masks: MaskSettings = field(default_factory=MaskSettings)
+
+
+def run_shape_from_shading(
+    files: SceneFiles,
+    output,
+    settings: SfsSettings | None = None,
+    grid_settings: GridSettings | None = None,
+    overwrite: bool = False,
+    progress=iter,
+):
+    """Refine a DEM by the shading in orthoimages and write the products.
+
+    Parameters
+    ----------
+    files : SceneFiles
+    output : path
+        Folder that appears when the run is done.
+    settings : SfsSettings, optional
+    grid_settings : GridSettings, optional
+    overwrite : bool
+    progress : callable
+        Wraps the iterable of images.
+
+    Returns
+    -------
+    results : dict of str to number
+        As in ``run.json``.
+    """
+    settings = settings or SfsSettings()
+    if settings.parametrisation not in PARAMETRISATIONS:
+        raise InputError(
+            f"parametrisation = {settings.parametrisation!r} is not known. Choose height or ray."
+        )
+    model = reflectance_model(settings.reflectance)
+    record = RunRecord("sfs", asdict(settings) | {"grid": asdict(grid_settings or GridSettings())})
+    with output_folder(output, overwrite) as folder:
+        with record.stage("read"):
+            scene = read_scene(files, grid_settings, prefer="dem", progress=progress)
+            observations, skipped = mask_observations(scene.observations, settings.masks)
+            record.add_inputs([*files.images, *files.dems])
+            record.add_skipped([*scene.skipped, *skipped])
+            if not observations:
+                raise InputError("No image can be used.\n" + "\n".join(s.reason for s in skipped))
+        with record.stage("solve"):
+            known = np.isfinite(scene.heights)
+            initial = fill_holes(scene.heights)
+            surface = _surface(scene.grid, initial, observations[0], settings.parametrisation)
+            start = surface.posts_from_heights(initial)
+            views = [OrthoView(observation) for observation in observations]
+            solution = solve_surface(surface, start, views, model, settings=settings.solver)
+        with record.stage("write"):
+            refined = surface.heights_from_posts(solution.value.u)
+            seen = _seen_posts(solution.value.measured)
+            refined[~(known | seen)] = np.nan
+            _write_products(folder, scene, initial, refined, observations[0], solution.value)
+            _write_exposures(folder, observations, record.skipped, solution.value)
+        record.results = _results(scene, refined, solution.value)
+        record.history = solution.history
+        record.outcome = {"name": solution.outcome, "sentence": solution.advice}
+        record.write(folder)
+    return record.results
+
+
+def mask_observations(observations, settings):
+    """Blank shadow and clipped pixels; an image that keeps too little is left out.
+
+    Parameters
+    ----------
+    observations : list of Observation
+    settings : MaskSettings
+
+    Returns
+    -------
+    usable : list of Observation
+    skipped : list of Skipped
+    """
+    usable, skipped = [], []
+    images = [observation.measured for observation in observations]
+    thresholds = shadow_thresholds(images, settings)
+    for observation, threshold in zip(observations, thresholds, strict=True):
+        measured = observation.measured
+        is_used = (measured > threshold) & (measured < observation.saturation)
+        if is_used.mean() < LEAST_LIT:
+            skipped.append(
+                Skipped(
+                    observation.name,
+                    f"{observation.name} has {100 * is_used.mean():.2g} % of its pixels between "
+                    f"the shadow threshold {threshold:.4g} and saturation; {100 * LEAST_LIT:g} % "
+                    "are needed. Give a lit image, or a lower --shadow-threshold.",
+                )
+            )
+            continue
+        usable.append(replace(observation, measured=np.where(is_used, measured, np.nan)))
+    return usable, skipped
+
+
+def _surface(grid, heights, first, parametrisation):
+    camera = first.spacecraft_position if parametrisation == "ray" else None
+    return Surface(grid, float(np.mean(heights, dtype=float)), camera)
+
+
+def _seen_posts(images):
+    """Posts whose four cells some image sees."""
+    seen = np.any([np.isfinite(image) for image in images], axis=0)
+    padded = np.pad(seen, 1, mode="edge")
+    return padded[1:, 1:] & padded[1:, :-1] & padded[:-1, 1:] & padded[:-1, :-1]
+
+
+def _write_products(folder, scene, initial, refined, first, surface):
+    grid = scene.grid
+    cells = cell_grid(grid)
+    write_raster(folder / "dem.tif", refined, grid, "height", "m")
+    write_raster(folder / "initial-dem.tif", scene.heights, grid, "height", "m")
+    for name, heights in (("before", initial), ("after", refined)):
+        shade = hillshade(grid, heights, first)
+        write_raster(folder / f"hillshade-{name}.tif", shade, grid, "cosine of incidence", "1")
+    write_raster(folder / "measured.tif", surface.measured[0], cells, "measured brightness")
+    modelled = np.where(np.isfinite(surface.measured[0]), surface.modelled[0], np.nan)
+    write_raster(folder / "modelled.tif", modelled, cells, "modelled brightness")
+    residual = relative_residual(surface)
+    write_raster(folder / "residual.tif", residual, cells, "rms of modelled - measured", "percent")
+
+
+def cell_grid(grid):
+    """The grid whose posts are the centres of this grid's cells."""
+    affine = grid.affine @ Affine.translation(0.5, 0.5)
+    return Grid((grid.shape[0] - 1, grid.shape[1] - 1), affine, grid.crs, grid.body)
+
+
+def hillshade(grid, heights, observation):
+    """Cosine of incidence under an image's own Sun, 0 where turned away.
+
+    Parameters
+    ----------
+    grid : Grid
+    heights : array (rows, cols), m
+    observation : Observation
+
+    Returns
+    -------
+    shade : array (rows, cols), dimensionless
+    """
+    xyz = grid.xyz(heights)
+    geometry = viewing_geometry(
+        xyz, surface_normals(xyz), observation.sun_position, observation.spacecraft_position
+    )
+    return np.clip(geometry.cos_incidence, 0.0, None)
+
+
+def relative_residual(surface):
+    """Root mean square of modelled - measured over the images, per cent of the median image.
+
+    Parameters
+    ----------
+    surface : SurfaceSolution
+
+    Returns
+    -------
+    residual : float array (rows - 1, cols - 1), per cent; NaN where no image counts
+    """
+    total = np.zeros(surface.measured[0].shape)
+    count = np.zeros_like(total)
+    for measured, modelled in zip(surface.measured, surface.modelled, strict=True):
+        difference = (modelled - measured) / np.nanmedian(measured)
+        total += np.nan_to_num(difference) ** 2
+        count += np.isfinite(difference)
+    return 100 * np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+
+
+def correlation(measured, modelled):
+    """Correlation of two images over the cells both have."""
+    both = np.isfinite(measured) & np.isfinite(modelled)
+    return float(np.corrcoef(measured[both], modelled[both])[0, 1])
+
+
+def _write_exposures(folder, observations, skipped, surface):
+    with open(folder / "exposures.csv", "w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["image", "exposure", "haze", "used", "reason"])
+        for k, observation in enumerate(observations):
+            exposure, haze = float(surface.exposures[k]), float(surface.hazes[k])
+            writer.writerow([observation.name, exposure, haze, 1, ""])
+        for skip in skipped:
+            writer.writerow([skip["image"], "", "", 0, skip["reason"]])
+
+
+def _results(scene, refined, surface):
+    change = refined - scene.heights
+    before = [correlation(*pair) for pair in zip(surface.measured, surface.started, strict=True)]
+    after = [correlation(*pair) for pair in zip(surface.measured, surface.modelled, strict=True)]
+    priors = surface.priors
+    brightness = [np.nanmedian(image) for image in surface.measured]
+    return {
+        "images": len(surface.measured),
+        "image_correlation_before": float(np.mean(before)),
+        "image_correlation_after": float(np.mean(after)),
+        "image_residual_percent": float(np.sqrt(np.nanmean(relative_residual(surface) ** 2))),
+        "height_change_rms_m": float(np.sqrt(np.nanmean(change**2))),
+        "noise_percent": float(100 * np.mean(priors.noise / brightness)),
+        "terrain_roughness_deg": float(np.degrees(priors.roughness)),
+    }
