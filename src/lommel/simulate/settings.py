@@ -62,8 +62,8 @@ class TerrainSettings:
         Relief of the maria relative to that of the highlands.
     """
 
-    octave_slope_deg: float = 2.4
-    hurst: float = 0.85
+    octave_slope_deg: float = 2.0
+    hurst: float = 0.75
     longest_octave: float = 64_000.0
     finest_detail: float = 6.0
     crater_coverage: float = 0.1
@@ -86,11 +86,14 @@ class AlbedoSettings:
         Excess albedo in and around fresh craters.
     mottling : float, dimensionless
         Rms of the fine variations.
+    mottling_length : float, m
+        Node distance of these variations: they are smooth below.
     """
 
     contrast: float = 1.6
     halo: float = 0.15
-    mottling: float = 0.02
+    mottling: float = 0.015
+    mottling_length: float = 5000.0
     __pydantic_config__ = FORBID_UNKNOWN
 
 
@@ -182,7 +185,7 @@ class FilmSettings:
     exposure: float = 220.0
     exposure_spread: float = 0.3
     haze: float = 0.0
-    noise: float = 0.01
+    noise: float = 0.0075
     bits: int = 8
     __pydantic_config__ = FORBID_UNKNOWN
 
@@ -202,7 +205,7 @@ class InitialDemSettings:
     """
 
     blur: float = 240.0
-    error: float = 2.0
+    error: float = 1.5
     error_length: float = 400.0
     __pydantic_config__ = FORBID_UNKNOWN
 

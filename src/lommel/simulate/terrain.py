@@ -23,6 +23,7 @@ SPLINE_RMS = 151 / 315  # rms of a cubic B-spline surface whose nodes have varia
 SPLINE_SLOPE = 1.18  # its rms slope along one axis, times node distance over rms
 MARE_OCTAVES = (96e3, 48e3, 24e3, 12e3, 6e3)  # m; outlines of the maria
 MARE_DEPTH = 800.0  # m; lava fills what lies low
+REGOLITH = 2500.0  # m; smaller craters bring up no bright rock
 EJECTA_REACH = 3.0  # crater radii
 RAY_REACH = 20.0  # crater radii
 RAYS = 16  # bright rays around a crater
@@ -84,8 +85,8 @@ def ground(settings, x, y):
     add_craters(heights, craters.where(is_fresh), x, y)
 
     albedo = 2.0 * (bright.contrast + (1.0 - bright.contrast) * mare) / (1.0 + bright.contrast)
-    albedo *= 1.0 + bright.mottling * spline_noise((seed, MOTTLING), 4 * resolution, x, y)
-    brighten(albedo, craters.where(is_fresh), bright.halo, x, y)
+    albedo *= 1.0 + bright.mottling * spline_noise((seed, MOTTLING), bright.mottling_length, x, y)
+    brighten(albedo, craters.where(is_fresh & (craters.diameter > REGOLITH)), bright.halo, x, y)
     for crater in settings.craters:
         one = _single(crater)
         add_craters(heights, one, x, y)
