@@ -44,7 +44,7 @@ class Level:
     tensors: tuple[np.ndarray, np.ndarray, np.ndarray]
     curvature: np.ndarray
     hourglass: float
-    mass: float
+    mass: np.ndarray
     inverse_diagonal: np.ndarray
     x: np.ndarray
     residual: np.ndarray
@@ -72,12 +72,16 @@ class NormalEquations:
         Weights of the second differences along rows, of the twist, and along columns.
     masses : array (depth,)
         Weight of each post of the grid halved 0, 1, 2, ... times.
+    posts : float32 array (rows, cols), optional
+        Weight of each single post, beside ``masses[0]``.
     """
 
-    def __init__(self, tensors, curvature, masses):
-        rows, cols = tensors[0].shape
+    def __init__(self, tensors, curvature, masses, posts=None):
+        rows, cols = tensors[0].shape[0] + 1, tensors[0].shape[1] + 1
         self.masses = np.asarray(masses, float)
-        self.levels = [_level((rows + 1, cols + 1), tensors, curvature, 0.0, self.masses[0])]
+        posts = np.zeros((1, cols), np.float32) if posts is None else posts
+        mass = posts + np.float32(self.masses[0])
+        self.levels = [_level((rows, cols), tensors, curvature, 0.0, mass)]
         while min(self.levels[-1].shape) > SMALLEST:
             finer = self.levels[-1]
             shape = coarse_shape(finer.shape)
@@ -86,7 +90,13 @@ class NormalEquations:
                 for fine, half in zip(finer.tensors, coarse, strict=True):
                     coarsen_cells(fine, half)
             weights = finer.curvature / np.float32(4)
-            mass = coarse_masses(self.masses, len(self.levels))[0]
+            if posts.shape[0] > 1:
+                posts, finer_posts = np.empty(shape, np.float32), posts
+                with threads_for(finer.shape):
+                    restrict(finer_posts, posts)
+            else:
+                posts = np.zeros((1, shape[1]), np.float32)
+            mass = posts + np.float32(coarse_masses(self.masses, len(self.levels))[0])
             self.levels.append(_level(shape, coarse, weights, HOURGLASS, mass))
         self._inverse = _dense_inverse(self.levels[-1])
 
@@ -282,7 +292,7 @@ def _level(shape, tensors, curvature, hourglass, mass):
         tensors,
         curvature.astype(np.float32),
         np.float32(hourglass),
-        np.float32(mass),
+        mass,
         *(np.zeros(shape, np.float32) for _ in range(5)),
     )
     with threads_for(shape):

@@ -74,7 +74,7 @@ def _gather_row(u_2, u_1, u0, u1, u2, w, wxx, mass, bend, top0, top1, bottom0, b
         along = bend[c] - two * bend[c + 1] + bend[c + 2]
         across = w_2 * u_2[c] + w_1 * u_1[c] + w0 * u0[c] + w1 * u1[c] + w2 * u2[c]
         cells = (top0[c + 1] + top1[c]) + (bottom0[c + 1] + bottom1[c])
-        out[c] = cells + wxx * along + across + mass * u0[c]
+        out[c] = cells + wxx * along + across + mass[c] * u0[c]
 
 
 @njit(cache=True, parallel=True)
@@ -90,8 +90,8 @@ def apply_operator(u, gpp, gpq, gqq, curvature, hourglass, mass, out):
         Weights of u_xx (along a row), u_xy and u_yy, per squared second difference.
     hourglass : float
         Share of tr(G) that resists a cell's twist.
-    mass : float
-        Weight of each post.
+    mass : float32 array (rows, cols) or (1, cols)
+        Weight of each post; one row serves all when the weight is the same.
     """
     rows, cols = u.shape
     blocks = (rows + BLOCK - 1) // BLOCK
@@ -145,7 +145,7 @@ def apply_operator(u, gpp, gpq, gqq, curvature, hourglass, mass, out):
                 u[min(r + 2, rows - 1)],
                 weights,
                 curvature[0],
-                np.float32(mass),
+                mass[min(r, mass.shape[0] - 1)],
                 bend,
                 flux[0],
                 flux[1],
@@ -157,6 +157,14 @@ def apply_operator(u, gpp, gpq, gqq, curvature, hourglass, mass, out):
             above[1] = flux[3]
 
 
+def apply_curvature(u, curvature, out):
+    """``out = K^T W K u``: the smoothness term alone; arguments as in `apply_operator`."""
+    rows, cols = u.shape
+    none = np.zeros((rows - 1, cols - 1), np.float32)
+    massless = np.zeros((1, cols), np.float32)
+    apply_operator(u, none, none, none, curvature, np.float32(0), massless, out)
+
+
 @njit(cache=True, parallel=True)
 def inverse_diagonal(gpp, gpq, gqq, curvature, hourglass, mass, out):
     """``out = 1 / diag(A)``; arguments as in `apply_operator`."""
@@ -166,7 +174,7 @@ def inverse_diagonal(gpp, gpq, gqq, curvature, hourglass, mass, out):
         weights = np.zeros(5, np.float32)
         _column_weights(r, rows, weights)
         row = out[r]
-        row[:] = np.float32(mass) + curvature[2] * weights[2]
+        row[:] = mass[min(r, mass.shape[0] - 1)] + curvature[2] * weights[2]
         _column_diagonal(row, curvature[0])
         if r < rows - 1:
             _cell_diagonal(gpp[r], gpq[r], gqq[r], 1.0, curvature[1], hourglass, row)

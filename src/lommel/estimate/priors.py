@@ -41,11 +41,14 @@ class Priors:
     masses : array (depth,), 1/m^2
         Inverse square error of the initial DEM, averaged over 1, 2, 4, ... posts; zero where that
         average is not to be trusted by itself.
+    albedo_contrast : float, dimensionless
+        Standard deviation of the difference of albedo between neighbouring cells.
     """
 
     noise: np.ndarray
     roughness: float
     masses: np.ndarray
+    albedo_contrast: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,8 @@ def estimate_priors(cells, residuals, gains, spacing, respond):
     mean_spacing = (spacing[0] * spacing[1]) ** 0.5
     slope_change = np.median((terrain * share * k**4)[ROUGHNESS_OCTAVES]) ** 0.5
     masses = _masses(k, relief * share, slope_change)
-    return Priors(noise, float(slope_change / mean_spacing), masses)
+    contrast = np.median(np.sqrt(excess) * k / brightness[:, None])
+    return Priors(noise, float(slope_change / mean_spacing), masses, float(contrast))
 
 
 def _excess_noise(relief, error, gains, spacing, respond, shape):

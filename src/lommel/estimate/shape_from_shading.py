@@ -29,12 +29,13 @@ from lommel.core.multigrid import (
     threads_for,
 )
 from lommel.core.normal_operator import (
-    apply_operator,
+    apply_curvature,
     coarse_shape,
     prolong_add,
     restrict,
     slope_adjoint,
 )
+from lommel.estimate.albedo_field import fit_albedo
 from lommel.estimate.priors import Priors, estimate_priors
 from lommel.estimate.shading_kernels import (
     SUM_COST,
@@ -67,6 +68,8 @@ class SolverSettings:
         V-cycles per Gauss-Newton step.
     estimate_exposure : bool
         Re-estimate the exposures after each step.
+    estimate_albedo : bool
+        Give albedo what the images show beyond shading; otherwise it stays 1, or as given.
     """
 
     max_steps: int = 8
@@ -74,6 +77,7 @@ class SolverSettings:
     cycle_tolerance: float = 0.03
     max_cycles: int = 40
     estimate_exposure: bool = True
+    estimate_albedo: bool = True
 
 
 @dataclass
@@ -183,10 +187,9 @@ class Problem:
 
     def prior_gradient(self, u):
         """Gradient of the prior terms at ``u``, and their cost."""
-        none = np.zeros((u.shape[0] - 1, u.shape[1] - 1), np.float32)
         out = np.empty_like(u)
         with threads_for(u.shape):
-            apply_operator(u, none, none, none, self.curvature, 0.0, 0.0, out)
+            apply_curvature(u, self.curvature, out)
         cost = dot(u, out) / 2
         cost += add_long_waves(u - self.initial, self.masses, out) / 2
         return out, cost
@@ -200,6 +203,7 @@ class SurfaceSolution:
     ----------
     u : float32 array (rows, cols), m
         Unknowns of the surface at the posts.
+    albedo : float32 array (rows - 1, cols - 1), mean 1
     exposures, hazes : array (images,)
     measured : list of float32 array (rows - 1, cols - 1), image units
         Images on the cells of the refined surface; NaN where not used.
@@ -210,6 +214,7 @@ class SurfaceSolution:
     """
 
     u: np.ndarray
+    albedo: np.ndarray
     exposures: np.ndarray
     hazes: np.ndarray
     measured: list
@@ -323,9 +328,11 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
         u, converged = _descend(level, u, steps, settings, history)
         correction, exposures = u - level.initial, level.exposures.copy()
     outcome, advice = _outcome(converged, history)
+    if settings.estimate_albedo and priors.albedo_contrast > 0:
+        _fit_albedo(finest, u, priors)
     modelled = [finest.predict(u, k) for k in range(len(views))]
     value = SurfaceSolution(
-        u, finest.exposures, finest.hazes, finest.cells, modelled, started, priors
+        u, finest.albedo, finest.exposures, finest.hazes, finest.cells, modelled, started, priors
     )
     return Solution(value, outcome, advice, history)
 
@@ -434,6 +441,16 @@ def _sample_images(level, u):
 def _fit_exposures(level):
     """Exposures that match the initial surface."""
     _, _, sums = level.assemble(level.initial)
+    level.exposures[:] = _best_exposures(sums, level.exposures)
+
+
+def _fit_albedo(level, u, priors):
+    """Albedo of the cells, given the surface; the exposures keep its mean at 1."""
+    shading = [level.predict(u, k) / level.albedo for k in range(len(level.views))]
+    level.albedo = fit_albedo(
+        shading, level.cells, priors.noise, priors.albedo_contrast, level.albedo
+    )
+    _, _, sums = level.assemble(u)
     level.exposures[:] = _best_exposures(sums, level.exposures)
 
 
