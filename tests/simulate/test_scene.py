@@ -96,8 +96,9 @@ def test_exposures_of_a_frame_do_not_depend_on_the_map():
             grid=replace(preset("sfs-patch").grid, rows=20, cols=20, spacing=400.0),
         )
     )
-    assert len(close_up.images) == 4
-    for image in close_up.images:
+    shared = [image for image in close_up.images if image.observation.name in strip_images]
+    assert len(shared) == 4
+    for image in shared:
         assert image.exposure == strip_images[image.observation.name].exposure
 
 

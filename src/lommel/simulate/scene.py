@@ -22,9 +22,10 @@ from lommel.simulate.imaging import (
     reflected,
     seen_window,
 )
+from lommel.simulate.noise import spline_noise
 from lommel.simulate.orbit import frame_cameras, sun_position
 from lommel.simulate.projection import orthoimage
-from lommel.simulate.terrain import DEM_ERROR, spline_noise
+from lommel.simulate.terrain import DEM_ERROR
 
 LEAST_MARGIN = 10  # posts around the grid, so that shadows fall in from outside
 BLUR_REACH = 4.0  # standard deviations that the initial DEM's Gaussian looks out to

@@ -281,6 +281,7 @@ CLOSE_UP = replace(
     STRIP,
     grid=replace(STRIP.grid, rows=300, cols=300, spacing=40.0, east=-19_000.0, north=-60_000.0),
     terrain=replace(STRIP.terrain, finest_detail=4.0),
+    suns=(*STRIP.suns, SunSettings(longitude_deg=-30.0, latitude_deg=-1.0)),
 )
 PRESETS = {
     "apollo-orbit": STRIP,
@@ -302,8 +303,8 @@ def preset(name):
     Parameters
     ----------
     name : {'apollo-orbit', 'sfs-patch', 'sfs-four-suns'}
-        A strip of nine overlapping frames; a close-up of it at 40 m; the same ground under four
-        Suns, for shape from shading at its best.
+        A strip of nine overlapping frames; a close-up of it at 40 m, which a second revolution
+        sees under the evening Sun; the same ground seen from above under Suns from four sides.
 
     Returns
     -------
