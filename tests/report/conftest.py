@@ -104,10 +104,24 @@ def _write_terrain_products(folder):
         ("hillshade-after", shades[1], "1"),
         ("measured", measured, "1"),
         ("modelled", modelled, "1"),
-        ("residual", modelled - measured, "1"),
+        ("residual", np.abs(modelled - measured), "percent"),
     ):
         write_raster(folder / f"{name}.tif", values, grid, name, unit)
-    _record(folder, command="sfs", results={"height_rmse_m": 0.137, "correlation_after": 0.952})
+    _record(
+        folder,
+        command="sfs",
+        results={
+            "images": 2,
+            "image_correlation_before": 0.131,
+            "image_correlation_after": 0.952,
+            "height_change_rms_m": 6.689,
+        },
+        history=[
+            {"stride": stride, "cost": 9e4 + 1e4 / stride - step, "step_m": 3.0 * 4.0**-step}
+            for stride in (4, 2, 1)
+            for step in range(3)
+        ],
+    )
 
 
 @pytest.fixture

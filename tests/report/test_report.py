@@ -56,6 +56,8 @@ def test_page_says_results_outcome_settings_stages_and_digests(demo_report):
         "exposure RMS 0.4321 %",
         "albedo error 2.7 %",
         "Converged after 7 steps.",
+        "image correlation 0.131 → 0.952",
+        "height change RMS 6.689 m",
         "reflectance lunar-lambert",
         "read images 1.25 310.5",
         "ab" * 32,
@@ -101,7 +103,7 @@ def test_each_product_has_its_picture_beside_it(demo_report):
 
 def test_every_picture_has_words(demo_report):
     images = Page(demo_report).attributes("img")
-    assert len(images) == 15
+    assert len(images) == 16
     assert all(image["alt"] for image in images)
 
 

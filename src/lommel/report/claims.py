@@ -100,11 +100,12 @@ def relief_before_and_after(contents):
     if after is None:
         return None
     pair = [preview for preview in (before, after) if preview]
-    high = drawing.percent_clipped(*[preview.values for preview in pair], high=99.5)[1]
+    limits = drawing.percent_clipped(*[preview.values for preview in pair])
+    label = "cosine of incidence"
     titles = ("Before: initial terrain", "After: refined terrain")[-len(pair) :]
     names = ("hillshade-before", "hillshade-after")[-len(pair) :]
     panels = [
-        _map(preview, name, title, "hillshade, no unit", "gray", (0.0, high), has_shadow=True)
+        _map(preview, name, title, label, "gray", limits, shadow=preview.values <= 0)
         for preview, name, title in zip(pair, names, titles, strict=True)
     ]
     return Claim(
@@ -119,24 +120,29 @@ def relief_before_and_after(contents):
 def measured_against_modelled(contents):
     """The image, what the model makes of it, the difference and its distribution."""
     measured, modelled = contents.preview("measured.tif"), contents.preview("modelled.tif")
-    if measured is None or modelled is None:
+    if measured is None or modelled is None or measured.values.shape != modelled.values.shape:
         return None
     limits = drawing.percent_clipped(measured.values, modelled.values)
-    unit = f"image value{', ' + measured.unit if measured.unit not in ('', '1') else ''}"
+    unused = "shadow, clipped or no data"
     panels = [
-        _map(measured, "measured", "Measured image", unit, "gray", limits),
-        _map(modelled, "modelled", "Modelled image", unit, "gray", limits, has_shadow=True),
+        _map(measured, "measured", "Measured image", "image value", "gray", limits, unused),
+        _map(modelled, "modelled", "Modelled image", "image value", "gray", limits, unused),
     ]
-    text = "The same grey scale for both."
+    typical = _median(measured.values)
+    difference = replace(modelled, values=100 * (modelled.values - measured.values) / typical)
+    panels += _difference_panels(difference, unused)
     residual = contents.preview("residual.tif")
-    if residual is not None:
-        panels += _residual_panels(residual)
-        text += (
-            " Residual is modelled minus measured; relief that is left in it is relief the "
-            "terrain does not have."
-        )
-        if residual.shrink > 1:
-            text += f" The histogram counts means of {residual.shrink:.1f} pixels squared."
+    if residual is not None and contents.record["results"].get("images", 1) > 1:
+        title, label = "All images", f"rms residual, {residual.unit}"
+        limits = (0.0, drawing.percent_clipped(residual.values)[1])
+        panels.append(_map(residual, "residual", title, label, "cividis", limits, unused))
+    text = (
+        "The first image, on the same grey scale measured and modelled. The difference is modelled "
+        "minus measured in per cent of the median image value; relief that shows in it is relief "
+        "that the terrain lacks."
+    )
+    if measured.shrink > 1:
+        text += f" The histogram counts means of {measured.shrink:.1f} pixels squared."
     wide = drawing.is_wide(measured.grid)
     return Claim("How well the terrain explains the image", text, tuple(panels), wide)
 
@@ -161,7 +167,7 @@ def height_and_change(contents):
 def exposures_of_images(contents):
     """Exposure and haze of each image along the strip."""
     exposures = contents.exposures
-    if exposures is None or not (exposures.used & np.isfinite(exposures.exposure)).any():
+    if exposures is None or (exposures.used & np.isfinite(exposures.exposure)).sum() < 2:
         return None
     words = "Relative exposure of each image with its standard error, and its haze"
     panel = Panel("exposures", plots.draw_exposures(exposures), words)
@@ -178,12 +184,11 @@ def coverage_and_residual(contents):
         limits = (0.0, max(float(np.nanmax(seen.values, initial=1.0)), 1.0))
         title, label = "Images per point", "images used at a point"
         panels.append(_map(seen, "count", title, label, "cividis", limits, whole_numbers=True))
-    residual = contents.preview("residual.tif") if contents.preview("albedo.tif") else None
+    residual = contents.preview("residual.tif") if count is not None else None
     if residual is not None:
         limits = (0.0, drawing.percent_clipped(residual.values)[1])
-        label = (
-            f"error of the albedo{', ' + residual.unit if residual.unit not in ('', '1') else ''}"
-        )
+        unit = residual.unit.replace("percent", "%")
+        label = "standard error" + (f", {unit}" if unit not in ("", "1") else "")
         panels.append(_map(residual, "residual", "Error of the albedo", label, "cividis", limits))
     text = "An albedo is as good as the images that agree on it: many images, small error."
     wide = bool(panels) and drawing.is_wide((count or residual).grid)
@@ -196,26 +201,33 @@ def convergence(contents):
     if png is None:
         return None
     text = "The cost should fall and level off; a run that still falls stopped too early."
+    if any("stride" in row for row in contents.record["history"]):
+        text += " Coarse levels come first: 1/8 is solved on every eighth post, on fewer cells."
     words = "Cost after each step of the solver"
     return Claim("Convergence", text, (Panel("convergence", png, words),))
 
 
-def _residual_panels(residual):
-    unit = f"residual{', ' + residual.unit if residual.unit not in ('', '1') else ''}"
-    limits = drawing.about_zero(residual.values)
-    panels = [_map(residual, "residual", "Modelled minus measured", unit, "RdBu_r", limits)]
-    png = plots.draw_histogram(residual.values, unit)
+def _difference_panels(difference, unused):
+    label = "difference, % of the median"
+    limits = drawing.about_zero(difference.values)
+    title = "Modelled minus measured"
+    panels = [_map(difference, "image-difference", title, label, "RdBu_r", limits, unused)]
+    png = plots.draw_histogram(difference.values, label)
     if png:
-        panels.append(Panel("residual-histogram", png, f"Histogram of the {unit}"))
+        panels.append(Panel("image-difference-histogram", png, f"Histogram of the {label}"))
     return panels
 
 
-def _map(preview, name, title, label, colours, limits, has_shadow=False, whole_numbers=False):
-    shadow = preview.values <= 0 if has_shadow else None
-    png = drawing.draw_map(preview, title, label, colours, limits, shadow, whole_numbers)
+def _map(preview, name, title, label, colours, limits, missing="no data", **options):
+    png = drawing.draw_map(preview, title, label, colours, limits, missing, **options)
     return Panel(name, png, f"{title}: map of {label}")
 
 
 def _by_median(preview):
-    median = np.nanmedian(preview.values) if np.isfinite(preview.values).any() else 1.0
-    return replace(preview, values=preview.values / (median or 1.0))
+    return replace(preview, values=preview.values / _median(preview.values))
+
+
+def _median(values):
+    """Median of what is known; 1 where that is nothing or zero, for use as a divisor."""
+    values = values[np.isfinite(values)]
+    return (float(np.median(values)) if values.size else 0.0) or 1.0

@@ -72,7 +72,9 @@ def is_wide(grid):
     return _height_by_width(grid) < WIDE
 
 
-def draw_map(preview, title, label, colours, limits, shadow=None, whole_numbers=False):
+def draw_map(
+    preview, title, label, colours, limits, missing="no data", shadow=None, whole_numbers=False
+):
     """A map with axes, colour bar and a legend of what is missing.
 
     Parameters
@@ -85,6 +87,8 @@ def draw_map(preview, title, label, colours, limits, shadow=None, whole_numbers=
         Name of a matplotlib colour map.
     limits : tuple of float
         Values at the ends of the colour bar; values beyond take the end's colour.
+    missing : str
+        What NaN means, for the legend.
     shadow : bool array (rows, cols), optional
         Drawn in a colour of its own.
     whole_numbers : bool
@@ -97,16 +101,17 @@ def draw_map(preview, title, label, colours, limits, shadow=None, whole_numbers=
     values, grid = preview.values, preview.grid
     left, bottom, right, top, *names = _frame(grid)
     place = {"extent": (left, right, bottom, top), "aspect": _aspect(grid)}
+    handles = []
+    if shadow is not None and shadow.any():
+        handles.append(Patch(facecolor=SHADOW, label="shadow: no direct sunlight"))
+    if np.isnan(values).any():
+        handles.append(Patch(**MISSING, label=missing))
     with styled():
-        figure, axes, bar_axes, legend_place = _map_frame(grid)
+        figure, axes, bar_axes, legend_place = _map_frame(grid, bool(handles))
         image = axes.imshow(values, cmap=colours, vmin=limits[0], vmax=limits[1], **place)
-        handles = []
-        if shadow is not None and shadow.any():
+        if shadow is not None:
             paint = np.where(shadow, 1.0, np.nan)
             axes.imshow(paint, cmap=ListedColormap([SHADOW]), interpolation="nearest", **place)
-            handles.append(Patch(facecolor=SHADOW, label="shadow: no direct sunlight"))
-        if np.isnan(values).any():
-            handles.append(Patch(**MISSING, label="no data"))
         axes.set_title(title)
         axes.set(xlabel=names[0], ylabel=names[1])
         axes.locator_params(nbins=8 if is_wide(grid) else 5, axis="x")
@@ -151,14 +156,16 @@ def about_zero(*arrays, share=99.0):
     return -reach, reach
 
 
-def _map_frame(grid):
+def _map_frame(grid, has_legend):
     """A figure with axes for map and colour bar at fixed margins, so that pairs line up, inches.
 
-    The colour bar stands beside the map, or below it where the map takes the whole width.
+    The colour bar stands beside the map, or below it where the map takes the whole width; the
+    legend beside that bar, or below the map.
     """
     wide = is_wide(grid)
     width = FULL_WIDTH if wide else PANEL_WIDTH
-    left, right, above, below = (0.66, 0.2, 0.32, 1.12) if wide else (0.66, 0.98, 0.32, 0.8)
+    left, right, above, below = (0.66, 0.2, 0.32, 1.12) if wide else (0.66, 0.98, 0.32, 0.54)
+    below += 0.26 if has_legend and not wide else 0.0
     map_width = width - left - right
     map_height = float(np.clip(map_width * _height_by_width(grid), 0.6, TALLEST))
     height = above + map_height + below

@@ -87,7 +87,7 @@ def build_page(folder):
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(inline=_inline, number=format_number, words=_in_words)
+    environment.filters.update(inline=_inline, flat=_flat, number=format_number, words=_in_words)
     html = environment.get_template("page.html.j2").render(parts=parts, headlines=HEADLINES)
     page = folder / "report.html"
     _write(page, html.encode("utf-8", "replace"))
@@ -95,7 +95,9 @@ def build_page(folder):
 
 
 def quantities_of(results, targets):
-    """Results in words: the end of a name is its unit.
+    """Results in words, those with a unit first.
+
+    The end of a name is its unit; ``..._before`` and ``..._after`` become one line.
 
     Parameters
     ----------
@@ -109,17 +111,23 @@ def quantities_of(results, targets):
 
     Examples
     --------
-    >>> quantities_of({"height_rmse_m": 0.13712}, {})[0]
-    Quantity(words='height RMSE', value='0.1371', unit='m', target='')
+    >>> quantities_of({"height_rmse_before_m": 2.74, "height_rmse_after_m": 0.13712}, {})[0]
+    Quantity(words='height RMSE', value='2.74 → 0.1371', unit='m', target='')
     """
     quantities = []
     for name, value in results.items():
-        stem, _, end = name.rpartition("_")
+        before, after = name.replace("_after", "_before"), name.replace("_before", "_after")
+        shown, is_pair = format_number(value), before != after and {before, after} <= set(results)
+        if is_pair and name == before:
+            continue  # said together with the value after
+        if is_pair:
+            shown = f"{format_number(results[before])} → {shown}"
+        plain_name = name.replace("_after", "") if is_pair else name
+        stem, _, end = plain_name.rpartition("_")
         unit = UNITS.get(end, "") if stem else ""
-        target = format_number(targets[name]) if name in targets else ""
-        words = _in_words(stem if unit else name)
-        quantities.append(Quantity(words, format_number(value), unit, target))
-    return quantities
+        words = _in_words(stem if unit else plain_name)
+        quantities.append(Quantity(words, shown, unit, str(targets.get(name, ""))))
+    return sorted(quantities, key=lambda quantity: not quantity.unit)
 
 
 def format_number(value):
@@ -156,6 +164,14 @@ def _skipped(contents):
             if not used:
                 rows.setdefault(image, reason)
     return [{"image": image, "reason": reason} for image, reason in rows.items()]
+
+
+def _flat(values):
+    """Settings within settings as one list; the names of the outer ones are left off."""
+    flat = {}
+    for name, value in values.items():
+        flat.update(_flat(value) if isinstance(value, dict) else {name: value})
+    return flat
 
 
 def _in_words(name):

@@ -22,7 +22,7 @@ HISTOGRAM_SHARE = 99.5  # per cent of the residuals that the histogram spans
 
 
 def draw_exposures(exposures):
-    """Relative exposure of each image with its error, and the haze below where there is any.
+    """Exposure of each image by their mean, with its error; the haze below where there is any.
 
     Parameters
     ----------
@@ -35,7 +35,8 @@ def draw_exposures(exposures):
     used = exposures.used & np.isfinite(exposures.exposure)
     names = [_short(name) for name, keep in zip(exposures.images, used, strict=True) if keep]
     place = np.arange(len(names))
-    exposure, error = exposures.exposure[used], exposures.exposure_error[used]
+    mean = exposures.exposure[used].mean()
+    exposure, error = exposures.exposure[used] / mean, exposures.exposure_error[used] / mean
     haze = exposures.haze[used]
     has_haze = bool(np.any(np.nan_to_num(haze) != 0))
     with styled():
@@ -56,42 +57,57 @@ def draw_exposures(exposures):
 
 
 def draw_history(history):
-    """Cost and change of each step, on logarithmic axes.
+    """Cost and size of each step; levels of a coarse-to-fine solve are drawn apart.
 
     Parameters
     ----------
     history : list of dict
-        Each with a cost, and a step and a change where known.
+        Each with a ``cost``; where known, with ``change`` (relative) or ``step_m``, and with
+        ``stride``, the posts per step of the level.
 
     Returns
     -------
     png : bytes, or None when fewer than two steps have a cost
     """
-    rows = [row for row in history if isinstance(row.get("cost"), int | float)]
+    rows = [row for row in history if _is_number(row.get("cost"))]
     if len(rows) < 2:
         return None
-    steps = np.arange(len(rows))
-    cost = np.array([row["cost"] for row in rows], float)
-    change = np.array([_positive(row.get("change")) for row in rows])
+    steps, cost = np.arange(1, len(rows) + 1), np.array([row["cost"] for row in rows], float)
+    strides = np.array([row.get("stride", 1) for row in rows])
+    sizes = {"step_m": "step, m", "change": "relative change"}
     with styled():
         figure = new_figure(PANEL_WIDTH, 3.4)
         axes = figure.add_subplot()
-        axes.plot(steps, cost, color=ACCENT, marker="o", markersize=4, label="cost")
-        axes.set(title="Cost after each step", xlabel="step", ylabel="cost, no unit")
-        axes.set_yscale("log" if cost.min() > 0 else "linear")
+        for stride in dict.fromkeys(strides.tolist()):
+            level = strides == stride
+            axes.plot(steps[level], cost[level], color=ACCENT, marker="o", markersize=4)
+            if len(set(strides)) > 1:
+                note = {"xytext": (0, 7), "textcoords": "offset points", "fontsize": 7}
+                axes.annotate(f"1/{stride}", (steps[level][0], cost[level][0]), **note)
+        axes.set(title="Cost after each step", xlabel="step", ylabel="cost")
+        axes.set_yscale("log" if cost.min() > 0 and cost.max() > 3 * cost.min() else "linear")
         axes.yaxis.set_major_formatter(PLAIN)
         axes.yaxis.set_minor_formatter(NullFormatter())
         axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
-        if np.isfinite(change).any():
-            twin = axes.twinx()
-            twin.grid(False)
-            twin.spines["right"].set_visible(True)
-            twin.plot(steps, change, color=WARNING, marker="s", markersize=3, linestyle=":")
-            twin.set(ylabel="change of a step", yscale="log")
-            twin.yaxis.set_major_formatter(PLAIN)
-            twin.yaxis.label.set_color(WARNING)
-            axes.yaxis.label.set_color(ACCENT)
+        axes.margins(y=0.12)
+        for key, label in sizes.items():
+            size = np.array([_positive(row.get(key)) for row in rows])
+            if np.isfinite(size).any():
+                _draw_sizes(axes, steps, size, label)
+                break
         return to_png(figure)
+
+
+def _draw_sizes(axes, steps, size, label):
+    twin = axes.twinx()
+    twin.grid(False)
+    twin.spines["right"].set_visible(True)
+    twin.plot(steps, size, color=WARNING, marker="s", markersize=3, linestyle=":")
+    twin.set(ylabel=label, yscale="log")
+    twin.yaxis.set_major_formatter(PLAIN)
+    twin.yaxis.set_minor_formatter(NullFormatter())
+    twin.yaxis.label.set_color(WARNING)
+    axes.yaxis.label.set_color(ACCENT)
 
 
 def draw_histogram(values, label):
@@ -121,7 +137,7 @@ def draw_histogram(values, label):
         axes.hist(values, bins=61, range=(-reach, reach), weights=share, color=ACCENT)
         axes.axvline(0.0, color="#1f2328", linewidth=0.8)
         axes.set(
-            title=f"Residuals: rms {rms:.3g}, NMAD {nmad:.3g}",
+            title=f"rms {rms:.3g} %, NMAD {nmad:.3g} %",
             xlabel=label,
             ylabel="share of pixels, %",
         )
@@ -141,5 +157,9 @@ def _short(name):
     return stem if len(stem) <= NAME_LENGTH else stem[: NAME_LENGTH - 1] + "~"
 
 
+def _is_number(value):
+    return isinstance(value, int | float) and np.isfinite(value)
+
+
 def _positive(value):
-    return abs(float(value)) or np.nan if isinstance(value, int | float) else np.nan
+    return abs(float(value)) or np.nan if _is_number(value) else np.nan
