@@ -157,14 +157,6 @@ def apply_operator(u, gpp, gpq, gqq, curvature, hourglass, mass, out):
             above[1] = flux[3]
 
 
-def apply_curvature(u, curvature, out):
-    """``out = K^T W K u``: the smoothness term alone; arguments as in `apply_operator`."""
-    rows, cols = u.shape
-    none = np.zeros((rows - 1, cols - 1), np.float32)
-    massless = np.zeros((1, cols), np.float32)
-    apply_operator(u, none, none, none, curvature, np.float32(0), massless, out)
-
-
 @njit(cache=True, parallel=True)
 def inverse_diagonal(gpp, gpq, gqq, curvature, hourglass, mass, out):
     """``out = 1 / diag(A)``; arguments as in `apply_operator`."""

@@ -19,11 +19,12 @@ import numpy as np
 
 TILE = 1024  # cells along each side of the part that is analysed
 FIT_STEPS = 30  # of the multiplicative update; 10 settle it to 1 %
-SMALLEST_NOISE = 1e-3  # share of the mean brightness: no imager's photometry is better
+LEAST_NOISE = 1e-3  # share of the mean brightness: no imager's photometry is better
 ROUGHNESS_OCTAVES = slice(1, 4)  # the shortest octave is dulled by the pixels' own size
 # Photometric models and calibrations err at long waves, where a small error of brightness is a
-# large one of height: this share of the brightness is doubted in every octave.
-PHOTOMETRIC_ERROR = 0.0005
+# large one of height: 0.07 % of the brightness per octave is a contrast of 0.2 % per post.
+LEAST_CONTRAST = 0.002
+KNOWN_SHARE = 1.0  # of the terrain's power: the DEM knows the octaves in which it errs by less
 # Craters bend more light than random relief of the same spectrum: up to this factor
 BEND_MARGIN = 8.0
 
@@ -35,20 +36,24 @@ class Priors:
     Attributes
     ----------
     noise : array (images,), image units
-        Standard error of a measured value, model errors included.
+        Standard error of a measured value.
     roughness : float, rad
         Standard deviation of the change of slope from post to post.
-    masses : array (depth,), 1/m^2
-        Inverse square error of the initial DEM, averaged over 1, 2, 4, ... posts; zero where that
-        average is not to be trusted by itself.
     albedo_contrast : float, dimensionless
         Standard deviation of the difference of albedo between neighbouring cells.
+    dem_errors : array (depth,), m
+        Standard error of the initial DEM averaged over 1, 2, 4, ... posts; infinite where that
+        average tells nothing that shorter ones have not told.
+    smoothing : float, posts
+        The initial DEM is the better guess of the terrain only where it is smooth over so many
+        posts (standard deviation of a Gaussian).
     """
 
     noise: np.ndarray
     roughness: float
-    masses: np.ndarray
-    albedo_contrast: float = 0.0
+    albedo_contrast: float
+    dem_errors: np.ndarray
+    smoothing: float
 
 
 @dataclass(frozen=True)
@@ -88,35 +93,44 @@ def estimate_priors(cells, residuals, gains, spacing, respond):
     """
     brightness = np.array([np.nanmean(image) for image in cells])
     error = [separate(r, gain, spacing) for r, gain in zip(residuals, gains, strict=True)]
-    noise = np.array([np.sqrt(spectra.noise[:3].min()) for spectra in error])
-    noise = np.maximum(noise, SMALLEST_NOISE * brightness)
     k = error[0].wavenumber
     relief = _median([spectra.relief for spectra in error])
     terrain = _median(
         [separate(i, gain, spacing).relief for i, gain in zip(cells, gains, strict=True)]
     )
-    excess = _excess_noise(relief, error, gains, spacing, respond, cells[0].shape)
-    red = (PHOTOMETRIC_ERROR * brightness[:, None]) ** 2 * 16 * np.pi / (3 * (2**0.5 * k) ** 2)
-    share = _median([n**2 / (n**2 + e + r) for n, e, r in zip(noise, excess, red, strict=True)])
+    observed = np.stack([spectra.noise for spectra in error])
+    bend = _bend_spectra(relief, gains, spacing, respond, cells[0].shape)
+    # resampling dulls the noise of the shortest octave, so the next one tells its level
+    noise = np.sqrt(np.maximum(observed[:, 1] - bend[:, 1], observed[:, 0]))
+    noise = np.maximum(noise, LEAST_NOISE * brightness)
+    excess = np.maximum(observed - BEND_MARGIN * bend - noise[:, None] ** 2, 0.0)
+    contrasts = np.median(np.sqrt(excess) * k / brightness[:, None], axis=0)
+    contrast = max(float(contrasts[2:].min()), LEAST_CONTRAST)
+    # albedo at long waves drowns the slopes: the relief counts less there by this factor
+    drowned = 1 + (contrast * np.median(brightness / noise) / k) ** 2
+    level = np.median((terrain * k**4)[ROUGHNESS_OCTAVES])
     mean_spacing = (spacing[0] * spacing[1]) ** 0.5
-    slope_change = np.median((terrain * share * k**4)[ROUGHNESS_OCTAVES]) ** 0.5
-    masses = _masses(k, relief * share, slope_change)
-    contrast = np.median(np.sqrt(excess) * k / brightness[:, None])
-    return Priors(noise, float(slope_change / mean_spacing), masses, float(contrast))
+    is_unknown = relief[:-1] > KNOWN_SHARE * level / k[:-1] ** 4
+    first = int(np.flatnonzero(is_unknown).max(initial=-1)) + 1
+    return Priors(
+        noise=noise,
+        roughness=float(level**0.5 / mean_spacing),
+        albedo_contrast=contrast,
+        dem_errors=_dem_errors(drowned / relief, first),
+        smoothing=2.0**first / 2,
+    )
 
 
-def _excess_noise(relief, error, gains, spacing, respond, shape):
-    """Noise spectra beyond what the bend of the reflectance makes of missing relief.
+def _bend_spectra(relief, gains, spacing, respond, shape):
+    """What missing relief adds to the noise spectra because reflectance bends with slope.
 
     Relief with the DEM error's spectrum and random phases is added to the DEM and rendered: the
     part of the response that does not follow the slope is no noise, the solver models it.
     """
     field = _random_relief(relief, (shape[0] + 1, shape[1] + 1))
-    excess = []
-    for number, (spectra, gain) in enumerate(zip(error, gains, strict=True)):
-        bend = separate(respond(field, number), gain, spacing).noise
-        excess.append(np.maximum(spectra.noise - BEND_MARGIN * bend, 0.0))
-    return excess
+    return np.stack(
+        [separate(respond(field, k), gain, spacing).noise for k, gain in enumerate(gains)]
+    )
 
 
 def _random_relief(relief, shape):
@@ -184,18 +198,20 @@ def _fit_two_spectra(power, signal):
     return float(p), float(n)
 
 
-def _masses(k, relief, slope_change):
-    """Masses per halving whose sum has the DEM error's inverse spectrum at each octave."""
-    masses = np.zeros(k.size)
-    gathered = k**4 / slope_change**2  # what the curvature term holds already, at each octave
+def _dem_errors(precision, first):
+    """Errors of averages over 1, 2, 4, ... posts that hold each octave with the given precision.
+
+    Averages over 2^l posts hold waves from twice to four times that length on, octave l and all
+    longer ones; so each level from the first known one adds what its octave still lacks.
+    """
+    errors = np.full(precision.size, np.inf)
     held = 0.0
-    for level in range(1, k.size):
-        # averages over 2^level posts hold waves from twice to four times that length on
-        octave = level
-        precision = 1 / max(relief[octave], 1e-30) - gathered[octave] - held
-        masses[level] = max(precision, 0.0) * 4.0**level
-        held += max(precision, 0.0)
-    return masses
+    for level in range(first, precision.size):
+        lacking = precision[level] - held
+        if lacking > 0:
+            errors[level] = 1 / np.sqrt(lacking * 4.0**level)
+            held = precision[level]
+    return errors
 
 
 def _median(arrays):

@@ -18,6 +18,7 @@ leaves one 2x2 tensor per cell (`lommel.estimate.shading_kernels`); the linear s
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from lommel.core.least_squares import Solution
 from lommel.core.multigrid import (
@@ -29,7 +30,7 @@ from lommel.core.multigrid import (
     threads_for,
 )
 from lommel.core.normal_operator import (
-    apply_curvature,
+    apply_operator,
     coarse_shape,
     prolong_add,
     restrict,
@@ -96,6 +97,8 @@ class Problem:
     albedo: np.ndarray
     curvature: np.ndarray
     masses: np.ndarray
+    slope: np.ndarray
+    expected: np.ndarray
     geometry: list = field(default_factory=list)
 
     def prepare_geometry(self, u):
@@ -115,6 +118,7 @@ class Problem:
         lattice, _, _, gram, lights = self.geometry
         rows, cols = u.shape
         tensors = np.zeros((3, rows - 1, cols - 1), np.float32)
+        tensors[0], tensors[2] = self.slope
         gradient = np.zeros((2, rows - 1, cols - 1), np.float32)
         spacing = np.array(self.surface.grid.spacing, np.float32) * self.stride
         parameters = self.model.parameter_array()
@@ -178,20 +182,32 @@ class Problem:
         return gains
 
     def expect(self, priors):
-        """Take over priors: image weights, curvature weights and masses."""
+        """Take over priors: weights of every term, and the surface expected before the images."""
         s_row, s_col = self.surface.grid.spacing
+        mean = (s_row * s_col) ** 0.5
         self.weights = np.asarray(priors.noise, float) ** -2.0
-        weights = np.array([1 / s_col**2, 2 / (s_row * s_col), 1 / s_row**2])
-        self.curvature = (weights / priors.roughness**2).astype(np.float32)
-        self.masses = np.asarray(priors.masses, float)
+        curvature = np.array([1 / s_col**2, 2 / mean**2, 1 / s_row**2]) / priors.roughness**2
+        brightness = np.array([np.nanmean(cells) for cells in self.cells])
+        blur = (priors.albedo_contrast * np.median(brightness / priors.noise)) ** 2
+        self.curvature = curvature.astype(np.float32)
+        self.slope = (blur * curvature[[0, 2]]).astype(np.float32)
+        self.masses = np.asarray(priors.dem_errors, float) ** -2.0
+        self.expected = gaussian_filter(self.initial, priors.smoothing, mode="nearest")
 
     def prior_gradient(self, u):
         """Gradient of the prior terms at ``u``, and their cost."""
+        rows, cols = u.shape
+        change = u - self.expected
+        along, across = (np.full((rows - 1, cols - 1), weight) for weight in self.slope)
+        none = np.zeros_like(along)
+        massless = np.zeros((1, cols), np.float32)
         out = np.empty_like(u)
         with threads_for(u.shape):
-            apply_curvature(u, self.curvature, out)
-        cost = dot(u, out) / 2
-        cost += add_long_waves(u - self.initial, self.masses, out) / 2
+            apply_operator(
+                change, along, none, across, self.curvature, np.float32(0), massless, out
+            )
+        cost = dot(change, out) / 2
+        cost += add_long_waves(change, self.masses, out) / 2
         return out, cost
 
 
@@ -328,7 +344,7 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
         u, converged = _descend(level, u, steps, settings, history)
         correction, exposures = u - level.initial, level.exposures.copy()
     outcome, advice = _outcome(converged, history)
-    if settings.estimate_albedo and priors.albedo_contrast > 0:
+    if settings.estimate_albedo:
         _fit_albedo(finest, u, priors)
     modelled = [finest.predict(u, k) for k in range(len(views))]
     value = SurfaceSolution(
@@ -407,8 +423,10 @@ def _finest_problem(surface, initial, views, model, albedo):
         np.ascontiguousarray(initial, np.float32),
         [np.empty((rows - 1, cols - 1), np.float32) for _ in views],
         albedo,
-        np.zeros(3, np.float32),
-        np.zeros(1),
+        curvature=np.zeros(3, np.float32),
+        masses=np.zeros(1),
+        slope=np.zeros(2, np.float32),
+        expected=initial,
     )
 
 
@@ -418,6 +436,7 @@ def _coarser(finer):
         exposures=finer.exposures.copy(),
         stride=2 * finer.stride,
         initial=coarse_posts(finer.initial),
+        expected=coarse_posts(finer.expected),
         cells=[coarse_cells(cells) for cells in finer.cells],
         albedo=np.nan_to_num(coarse_cells(finer.albedo), nan=1.0),
         curvature=finer.curvature / 4,

@@ -162,6 +162,7 @@ def _write_products(folder, scene, initial, refined, first, surface):
     write_raster(folder / "measured.tif", surface.measured[0], cells, "measured brightness")
     modelled = np.where(np.isfinite(surface.measured[0]), surface.modelled[0], np.nan)
     write_raster(folder / "modelled.tif", modelled, cells, "modelled brightness")
+    write_raster(folder / "albedo.tif", surface.albedo, cells, "albedo")
     residual = relative_residual(surface)
     write_raster(folder / "residual.tif", residual, cells, "rms of modelled - measured", "percent")
 
@@ -231,16 +232,21 @@ def _write_exposures(folder, observations, skipped, surface):
 
 def _results(scene, refined, surface):
     change = refined - scene.heights
-    before = [correlation(*pair) for pair in zip(surface.measured, surface.started, strict=True)]
-    after = [correlation(*pair) for pair in zip(surface.measured, surface.modelled, strict=True)]
+    shading = [model / surface.albedo for model in surface.modelled]
     priors = surface.priors
     brightness = [np.nanmedian(image) for image in surface.measured]
     return {
         "images": len(surface.measured),
-        "image_correlation_before": float(np.mean(before)),
-        "image_correlation_after": float(np.mean(after)),
+        "image_correlation_before": _mean_correlation(surface.measured, surface.started),
+        "image_correlation_after": _mean_correlation(surface.measured, surface.modelled),
+        "image_correlation_without_albedo": _mean_correlation(surface.measured, shading),
         "image_residual_percent": float(np.sqrt(np.nanmean(relative_residual(surface) ** 2))),
         "height_change_rms_m": float(np.sqrt(np.nanmean(change**2))),
         "noise_percent": float(100 * np.mean(priors.noise / brightness)),
         "terrain_roughness_deg": float(np.degrees(priors.roughness)),
+        "albedo_contrast_percent": float(100 * priors.albedo_contrast),
     }
+
+
+def _mean_correlation(measured, modelled):
+    return float(np.mean([correlation(*pair) for pair in zip(measured, modelled, strict=True)]))
