@@ -68,7 +68,7 @@ class TerrainSettings:
     finest_detail: float = 6.0
     crater_coverage: float = 0.1
     largest_crater: float = 40_000.0
-    fresh_share: float = 0.12
+    fresh_share: float = 0.05
     mare_share: float = 0.4
     mare_relief: float = 0.3
     __pydantic_config__ = FORBID_UNKNOWN
@@ -251,7 +251,7 @@ class SceneSettings:
     albedo: AlbedoSettings = field(default_factory=AlbedoSettings)
     craters: tuple[CraterSettings, ...] = STRIP_CRATERS
     orbit: OrbitSettings = field(default_factory=OrbitSettings)
-    suns: tuple[SunSettings, ...] = (SunSettings(longitude_deg=88.0),)
+    suns: tuple[SunSettings, ...] = (SunSettings(longitude_deg=86.0),)
     film: FilmSettings = field(default_factory=FilmSettings)
     initial_dem: InitialDemSettings = field(default_factory=InitialDemSettings)
     __pydantic_config__ = FORBID_UNKNOWN
