@@ -1,0 +1,306 @@
+"""The commands: options in, stages run, paths of products out.
+
+stdout gets the paths of products (or what was asked to be shown), stderr the log. Exit status 0:
+done, 1: a stage failed, 2: the request was wrong. Stages are imported when they run, so that
+``lommel --help`` answers at once.
+"""
+
+import json
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import click
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from lommel import __version__
+from lommel.errors import InputError, LommelError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Albedo maps, exposures and refined terrain from orbital images of airless bodies.",
+)
+log = Console(stderr=True, highlight=False)
+
+Images = Annotated[
+    list[Path], typer.Argument(help="Orthoimages: any raster GDAL reads that has a CRS.")
+]
+Dems = Annotated[
+    list[Path],
+    typer.Option("--dem", help="DEM, metres above the reference sphere; repeat for tiles."),
+]
+SunTable = Annotated[
+    Path | None, typer.Option(help="Table of lines KEY x y z: the Sun, body-fixed, km or m.")
+]
+CraftTable = Annotated[
+    Path | None, typer.Option(help="Table of lines KEY x y z: the camera, body-fixed, km or m.")
+]
+Unit = Annotated[str, typer.Option(help="Unit of the tables: auto, m or km.")]
+Output = Annotated[Path, typer.Option(help="Folder for the products; made when all is done.")]
+Overwrite = Annotated[bool, typer.Option(help="Replace the output folder if it exists.")]
+Spacing = Annotated[float | None, typer.Option(help="Post spacing, metres. Default: the inputs'.")]
+Crs = Annotated[
+    str | None,
+    typer.Option(help="CRS of the products: WKT, PROJ text or a code like IAU_2015:30100."),
+]
+Bounds = Annotated[
+    tuple[float, float, float, float] | None,
+    typer.Option(
+        help="xmin ymin xmax ymax in units of the CRS. Default: where images and DEM meet."
+    ),
+]
+Reflectance = Annotated[
+    str,
+    typer.Option(
+        help="lunar-lambert, lunar-lambert-exponential, lambert, lommel-seeliger, minnaert, hapke, "
+        "or module:function."
+    ),
+]
+ShadowThreshold = Annotated[
+    float | None,
+    typer.Option(
+        help="Image value up to which a pixel is shadow. Default: found in the histogram."
+    ),
+]
+
+
+@app.command()
+def albedo(
+    images: Images,
+    dem: Dems,
+    output: Output,
+    sun_positions: SunTable = None,
+    spacecraft_positions: CraftTable = None,
+    positions_unit: Unit = "auto",
+    solver: Annotated[
+        str, typer.Option(help="projection, or alternating: the published iteration.")
+    ] = "projection",
+    loss: Annotated[str, typer.Option(help="cauchy, huber or least-squares.")] = "cauchy",
+    haze: Annotated[bool, typer.Option(help="Estimate an offset per image.")] = True,
+    fit_phase_factor: Annotated[
+        bool, typer.Option(help="Estimate c1, c2 of the phase factor exp(-c1 phase) + c2.")
+    ] = True,
+    reflectance: Reflectance = "lunar-lambert",
+    shadow_threshold: ShadowThreshold = None,
+    spacing: Spacing = None,
+    crs: Crs = None,
+    bounds: Bounds = None,
+    overwrite: Overwrite = False,
+):
+    """Albedo map and exposures from overlapping orthoimages and a DEM."""
+    from lommel.run.albedo import albedo_settings, run_albedo
+
+    settings = albedo_settings(
+        solver=solver,
+        loss=loss,
+        haze=haze,
+        fit_phase_factor=fit_phase_factor,
+        reflectance=reflectance,
+        shadow_threshold=shadow_threshold,
+    )
+    files = _files(images, dem, sun_positions, spacecraft_positions, positions_unit)
+    with _progress("Reading images") as progress:
+        run_albedo(files, output, settings, _grid(spacing, crs, bounds), overwrite, progress)
+    _finish(output)
+
+
+@app.command()
+def sfs(
+    images: Images,
+    dem: Dems,
+    output: Output,
+    sun_positions: SunTable = None,
+    spacecraft_positions: CraftTable = None,
+    positions_unit: Unit = "auto",
+    parametrisation: Annotated[
+        str,
+        typer.Option(
+            help="height: along the local vertical; ray: along the first image's view rays."
+        ),
+    ] = "height",
+    estimate_exposure: Annotated[
+        bool, typer.Option(help="Re-estimate the exposures with the surface.")
+    ] = True,
+    estimate_albedo: Annotated[
+        bool, typer.Option(help="Give albedo what shading cannot explain; otherwise it is 1.")
+    ] = True,
+    max_steps: Annotated[int, typer.Option(min=1, help="Gauss-Newton steps on the full grid.")] = 8,
+    reflectance: Reflectance = "lunar-lambert",
+    shadow_threshold: ShadowThreshold = None,
+    spacing: Spacing = None,
+    crs: Crs = None,
+    bounds: Bounds = None,
+    overwrite: Overwrite = False,
+):
+    """Refine a DEM by shape from shading (photoclinometry) in one or more images."""
+    from lommel.estimate.shape_from_shading import SolverSettings
+    from lommel.run.shape_from_shading import SfsSettings, run_shape_from_shading
+    from lommel.scene.masks import MaskSettings
+
+    settings = SfsSettings(
+        parametrisation=parametrisation,
+        reflectance=reflectance,
+        solver=SolverSettings(
+            max_steps=max_steps,
+            estimate_exposure=estimate_exposure,
+            estimate_albedo=estimate_albedo,
+        ),
+        masks=MaskSettings(shadow_threshold=shadow_threshold),
+    )
+    files = _files(images, dem, sun_positions, spacecraft_positions, positions_unit)
+    grid = _grid(spacing, crs, bounds)
+    with _progress("Reading images") as progress:
+        run_shape_from_shading(files, output, settings, grid, overwrite, progress)
+    _finish(output)
+
+
+@app.command()
+def simulate(
+    scene: Annotated[str, typer.Argument(help="Preset (apollo-orbit, sfs-patch) or SCENE.toml.")],
+    output: Output,
+    overwrite: Overwrite = False,
+):
+    """Make a scene with a known answer: truth, initial DEM, orthoimages, position tables."""
+    from lommel.run.simulate import run_simulate
+
+    with _progress("Taking images") as progress:
+        run_simulate(scene, output, overwrite, progress)
+    typer.echo(output)
+
+
+@app.command()
+def demo(
+    output: Annotated[Path, typer.Option(help="Folder for scene and products.")] = Path("demo"),
+    overwrite: Overwrite = False,
+):
+    """Simulate an orbit strip and run everything on it: the errors are known."""
+    from lommel.run.demo import run_demo
+
+    with _progress("Demo") as progress:
+        run_demo(output, overwrite, progress)
+    _finish(output)
+
+
+@app.command()
+def evaluate(
+    product: Annotated[Path, typer.Argument(help="DEM or albedo map (GeoTIFF).")],
+    reference: Annotated[
+        Path,
+        typer.Option(help="Raster, or CSV of points longitude_deg,latitude_deg,height_m."),
+    ],
+    border: Annotated[int, typer.Option(min=0, help="Posts left out along each edge.")] = 0,
+    quantity: Annotated[str, typer.Option(help="height or albedo.")] = "height",
+    json_path: Annotated[Path | None, typer.Option("--json", help="Also write a file.")] = None,
+):
+    """Compare a product with a reference."""
+    from lommel.run.evaluate import evaluate_product
+
+    errors = evaluate_product(product, reference, border, quantity, json_path)
+    for name, value in errors.items():
+        typer.echo(f"{name:20} {value:.6g}")
+
+
+@app.command()
+def info(
+    files: Annotated[list[Path], typer.Argument(help="Rasters.")],
+    sun_positions: SunTable = None,
+    spacecraft_positions: CraftTable = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+):
+    """Show what a raster holds: size, CRS, spacing, footprint; Sun and view with the tables."""
+    from lommel.run.info import describe
+
+    facts = [describe(path, sun_positions, spacecraft_positions) for path in files]
+    if as_json:
+        typer.echo(json.dumps(facts, indent=1))
+        return
+    for fact in facts:
+        for name, value in fact.items():
+            typer.echo(f"{name:24} {value}")
+        typer.echo("")
+
+
+@app.command()
+def report(folder: Annotated[Path, typer.Argument(help="Folder of a run.")]):
+    """Draw the figures and write report.html again."""
+    from lommel.report import write_report
+
+    typer.echo(write_report(folder))
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+):
+    if version:
+        typer.echo(f"lommel {__version__}")
+        raise typer.Exit
+
+
+def main():
+    """Run the command line and turn errors into messages and exit status."""
+    try:
+        app(standalone_mode=False)
+    except click.exceptions.Abort:
+        sys.exit(130)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(2)
+    except InputError as error:
+        log.print(f"[bold red]error[/] {_plain(error)}", soft_wrap=True)
+        sys.exit(2)
+    except LommelError as error:
+        log.print(f"[bold red]failed[/] {_plain(error)}", soft_wrap=True)
+        sys.exit(1)
+
+
+def _plain(error):
+    return str(error).replace("[", r"\\[")
+
+
+def _files(images, dems, sun_positions, spacecraft_positions, unit):
+    from lommel.run.inputs import SceneFiles
+
+    return SceneFiles(tuple(images), tuple(dems), sun_positions, spacecraft_positions, unit)
+
+
+def _grid(spacing, crs, bounds):
+    from lommel.run.inputs import GridSettings
+
+    return GridSettings(spacing, crs, bounds)
+
+
+@contextmanager
+def _progress(title):
+    """A function that wraps an iterable in a progress bar on stderr."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=log, transient=False) as bar:
+        yield lambda items, description=title: bar.track(items, description=description)
+
+
+def _finish(output):
+    """Draw the report, print outcome and skipped images, and the paths of the products."""
+    from lommel.report import write_report
+
+    page = write_report(output)
+    record = json.loads((output / "run.json").read_text(encoding="utf-8"))
+    for skip in record["skipped"]:
+        log.print(f"[yellow]left out[/] {_plain(skip['reason'])}", soft_wrap=True)
+    log.print(record["outcome"]["sentence"], soft_wrap=True)
+    for name, value in record["results"].items():
+        log.print(
+            f"  {name:40} {value:.5g}" if isinstance(value, float) else f"  {name:40} {value}"
+        )
+    for path in sorted(output.glob("*.tif")):
+        typer.echo(path)
+    typer.echo(page)
