@@ -83,6 +83,8 @@ class RunRecord:
         Images left out and why.
     results : dict of str to number
         Names carry the unit.
+    targets : dict of str to str
+        For some of the results, what they should reach.
     history : list of dict
         Cost and step of each iteration.
     outcome : dict
@@ -95,6 +97,7 @@ class RunRecord:
     stages: list[dict] = field(default_factory=list)
     skipped: list[dict] = field(default_factory=list)
     results: dict = field(default_factory=dict)
+    targets: dict = field(default_factory=dict)
     history: list[dict] = field(default_factory=list)
     outcome: dict = field(default_factory=dict)
 

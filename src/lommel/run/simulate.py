@@ -93,7 +93,8 @@ def run_simulate(scene, output, overwrite=False, progress=iter):
         record.results = {"images": len(simulated.images)}
         record.outcome = {
             "name": "done",
-            "sentence": f"Simulated {len(simulated.images)} images of {record.settings['grid']}.",
+            "sentence": f"Simulated {len(simulated.images)} images of {settings.grid.rows} x "
+            f"{settings.grid.cols} posts at {settings.grid.spacing:g} m.",
         }
         record.write(staging)
     return SceneFolder(Path(output))
