@@ -169,7 +169,6 @@ class Work(NamedTuple):
     u: np.ndarray
     u_shared: np.ndarray
     top: np.ndarray
-    bottom: np.ndarray
     inverse: np.ndarray
     residual: np.ndarray
 
@@ -322,9 +321,11 @@ def residual_sums(residual, weight, precision, w, count, scale, loss, scatter, h
 
 
 @njit(cache=True, error_model="numpy")
-def _first_sweep(row, samples, images, state, scale, loss, work, albedo, spread, freedom, count):
+def _first_sweep(
+    row, samples, images, state, scale, loss, work, albedo, bottom, spread, freedom, count
+):
     """Brightness and robust weights of every image in this row, then the best albedo."""
-    top, bottom = work.top, work.bottom
+    top = work.top
     top[:], bottom[:], spread[:], freedom[:], count[:] = 0.0, 0.0, 0.0, 0.0, 0
     for a in range(images.size):
         k = images[a]
@@ -541,7 +542,6 @@ def _work_for(images, cols):
         np.zeros(cols),
         np.zeros(cols),
         np.zeros(cols),
-        np.zeros(cols),
     )
 
 
@@ -585,11 +585,11 @@ def accumulate(samples, pairs, state, scale, loss, maps, sums):
                     loss,
                     work,
                     albedo,
+                    maps.information[row],
                     maps.spread[row],
                     maps.freedom[row],
                     count,
                 )
-                maps.information[row] = work.bottom
                 _second_sweep(
                     row, samples, images, state, scale, loss, work, here, albedo, scatter, count
                 )
