@@ -61,6 +61,11 @@ Reflectance = Annotated[
         "or module:function."
     ),
 ]
+BY_SOLVER = "Default: as published with --solver alternating, else "
+OwnReflectance = Annotated[
+    str | None,
+    typer.Option(help=f"Reflectance model, as for sfs. {BY_SOLVER}lunar-lambert."),
+]
 ShadowThreshold = Annotated[
     float | None,
     typer.Option(
@@ -80,12 +85,20 @@ def albedo(
     solver: Annotated[
         str, typer.Option(help="projection, or alternating: the published iteration.")
     ] = "projection",
-    loss: Annotated[str, typer.Option(help="cauchy, huber or least-squares.")] = "cauchy",
-    haze: Annotated[bool, typer.Option(help="Estimate an offset per image.")] = True,
+    loss: Annotated[
+        str | None, typer.Option(help=f"cauchy, huber or least-squares. {BY_SOLVER}cauchy.")
+    ] = None,
+    haze: Annotated[
+        bool | None, typer.Option(help=f"Estimate an offset per image. {BY_SOLVER}yes.")
+    ] = None,
     fit_phase_factor: Annotated[
-        bool, typer.Option(help="Estimate c1, c2 of the phase factor exp(-c1 phase) + c2.")
-    ] = True,
-    reflectance: Reflectance = "lunar-lambert",
+        bool | None,
+        typer.Option(help=f"Estimate c1, c2 of the factor exp(-c1 phase) + c2. {BY_SOLVER}yes."),
+    ] = None,
+    fit_falloff: Annotated[
+        bool | None, typer.Option(help=f"Estimate the lens's darker corners. {BY_SOLVER}yes.")
+    ] = None,
+    reflectance: OwnReflectance = None,
     shadow_threshold: ShadowThreshold = None,
     spacing: Spacing = None,
     crs: Crs = None,
@@ -100,6 +113,7 @@ def albedo(
         loss=loss,
         haze=haze,
         fit_phase_factor=fit_phase_factor,
+        fit_falloff=fit_falloff,
         reflectance=reflectance,
         shadow_threshold=shadow_threshold,
     )

@@ -45,6 +45,7 @@ from lommel.estimate.albedo_kernels import (
     accumulate,
     empty_sums,
 )
+from lommel.estimate.albedo_quality import disagreement
 from lommel.estimate.albedo_samples import collect_samples, overlapping_pairs
 from lommel.scene.masks import MaskSettings
 
@@ -141,6 +142,8 @@ class AlbedoResult:
         c1 (per rad), c2, v2 (per rad^2) and v4 (per rad^4), with their standard errors.
     groups : tuple of tuple of int
         Images connected by overlap; the scale between two groups is set by the prior alone.
+    disagreement_before, disagreement : float
+        Of the images as they are, and by the result; `lommel.estimate.albedo_quality`.
     noise : float
         Standard error of a residual, as a share of the image's level.
     repetition : float
@@ -160,6 +163,8 @@ class AlbedoResult:
     reasons: tuple[str, ...]
     shared: dict
     groups: tuple[tuple[int, ...], ...]
+    disagreement_before: float
+    disagreement: float
     noise: float
     repetition: float
     history: list[dict]
@@ -538,6 +543,10 @@ def _result(problem, point, reasons, history, outcome, advice):
         reasons=tuple(reasons),
         shared=shared,
         groups=tuple(tuple(indices[group].tolist()) for group in groups),
+        disagreement_before=disagreement(problem.samples, problem.shape),
+        disagreement=disagreement(
+            problem.samples, problem.shape, state.exposure, state.haze, state.shared
+        ),
         noise=point.scale,
         repetition=point.repetition,
         history=history,

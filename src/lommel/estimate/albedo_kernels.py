@@ -10,8 +10,8 @@ brightness :math:`A_{ij} M^k_{ij} + b^k`,
           H = \sum w J^T J - \sum_{ij} \frac{(\sum_k w M J)^T (\sum_k w M J)}{\sum_k w M^2}
 
 where J are the derivatives of the brightness by the image parameters (log exposure, haze in units
-of the image's level) and by the shared ones (c1, c2, v2, v4). Loops run along rows of the grid; sums are
-kept per block of rows, so that results do not depend on the number of threads.
+of the image's level) and by the shared ones (c1, c2, v2, v4). Loops run along rows of the grid;
+sums are kept per block of rows, so that results do not depend on the number of threads.
 """
 
 from typing import NamedTuple

@@ -7,6 +7,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from lommel.errors import InputError
+from lommel.scene.body import local_frame
+from lommel.scene.geometry import surface_normals, unit
 
 DETAIL = 5.0  # posts, scale up to which brightness counts as relief and not as large-scale albedo
 
@@ -179,6 +181,28 @@ def shading_in_albedo(albedo, slope_to_sun):
     brightness, slope = brightness[inside], slope[inside]
     correlation = float(np.corrcoef(brightness, slope)[0, 1])
     return correlation, correlation * float(brightness.std() / slope.std())
+
+
+def slope_towards_sun(grid, heights, sun_positions):
+    """Slope of the terrain along the mean direction of the Sun, positive where it faces the Sun.
+
+    Parameters
+    ----------
+    grid : Grid
+    heights : array (rows, cols), m
+    sun_positions : list of array (3,), m, body-fixed
+
+    Returns
+    -------
+    slope : array (rows, cols), dimensionless
+    """
+    normals = surface_normals(grid.xyz(heights))
+    east, north, up = local_frame(*grid.lonlat())
+    to_sun = np.mean([unit(np.asarray(sun, float)) for sun in sun_positions], axis=0)
+    sun_east, sun_north = east @ to_sun, north @ to_sun
+    towards = np.einsum("...i,...i", normals, east) * sun_east
+    towards += np.einsum("...i,...i", normals, north) * sun_north
+    return towards / np.einsum("...i,...i", normals, up) / np.hypot(sun_east, sun_north)
 
 
 def _detail(values, good):

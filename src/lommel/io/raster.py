@@ -26,6 +26,7 @@ from lommel.scene.grid import Grid, Window, read_crs
 
 PIXEL_LIMIT = 2**34  # pixels of one raster side by side; beyond it the header is not believable
 DOWNSAMPLING = 1.5  # input pixels per post from which area means replace interpolation
+CLIPPED_8_BIT = (0.0, 255.0)  # image values that only say "at most" and "at least"
 MARGIN = 4  # pixels read around a window so that interpolation sees its neighbours
 
 
@@ -136,8 +137,28 @@ def read_pixels(path, window=None):
     return values
 
 
-def read_on_grid(path, grid, body=MOON):
-    """First band resampled onto a grid: area means from finer input, else cubic.
+def read_image_on_grid(path, grid, body=MOON):
+    """Brightness resampled onto a grid: area means from finer input, else bilinear.
+
+    Pixels at either end of an 8-bit image, 0 and 255, were clipped: their brightness is unknown,
+    and they count as missing before they can mix with their neighbours.
+
+    Parameters
+    ----------
+    path : path
+    grid : Grid
+    body : Body
+
+    Returns
+    -------
+    values : float32 array (rows, cols), NaN where the brightness is not known
+    """
+    clips = raster_info(path, body).dtype == "uint8"
+    return read_on_grid(path, grid, body, Resampling.bilinear, CLIPPED_8_BIT if clips else ())
+
+
+def read_on_grid(path, grid, body=MOON, interpolation=Resampling.cubic, unknown=()):
+    """First band resampled onto a grid: area means from finer input, else interpolated.
 
     Missing input never leaks: a post is NaN when the input pixels at its place are missing.
 
@@ -146,6 +167,10 @@ def read_on_grid(path, grid, body=MOON):
     path : path
     grid : Grid
     body : Body
+    interpolation : Resampling
+        Cubic for terrain; bilinear for images, whose grain cubic interpolation would enlarge.
+    unknown : tuple of float
+        Values that stand for missing pixels.
 
     Returns
     -------
@@ -156,25 +181,27 @@ def read_on_grid(path, grid, body=MOON):
     if part.is_empty:
         return np.full(grid.shape, np.nan, np.float32)
     values, source = read_pixels(path, part), source.cut(part)
+    values[np.isin(values, unknown)] = np.nan
     if source.is_same(grid):
         return values
-    return resample(values, source, grid)
+    return resample(values, source, grid, interpolation)
 
 
-def resample(values, source, grid):
+def resample(values, source, grid, interpolation=Resampling.cubic):
     """An array on one grid brought onto another; see `read_on_grid` for how.
 
     Parameters
     ----------
     values : float32 array (rows, cols) on ``source``
     source, grid : Grid
+    interpolation : Resampling
 
     Returns
     -------
     values : float32 array on ``grid``, NaN where the source has nothing
     """
     is_finer = max(grid.spacing) > DOWNSAMPLING * max(source.spacing)
-    method = Resampling.average if is_finer else Resampling.cubic
+    method = Resampling.average if is_finer else interpolation
     result = np.full(grid.shape, np.nan, np.float32)
     frames = {
         "src_transform": source.affine,
@@ -186,7 +213,7 @@ def resample(values, source, grid):
         "tolerance": 0.0,  # exact transform at every post: the default errs by 1/8 pixel
     }
     reproject(values, result, resampling=method, **frames)
-    if not is_finer and np.isnan(values).any():  # cubic reaches 2 pixels: restore the hole's shape
+    if not is_finer and np.isnan(values).any():  # kernels reach 2 pixels: restore the hole's shape
         nearest = np.full(grid.shape, np.nan, np.float32)
         reproject(values, nearest, resampling=Resampling.nearest, **frames)
         result[np.isnan(nearest)] = np.nan

@@ -12,7 +12,7 @@ import numpy as np
 
 from lommel.errors import GeometryError, InputError, LommelError
 from lommel.io.positions import find_position, read_positions
-from lommel.io.raster import raster_info, read_grid, read_on_grid
+from lommel.io.raster import raster_info, read_grid, read_image_on_grid, read_on_grid
 from lommel.scene.body import MOON
 from lommel.scene.geometry import Observation
 from lommel.scene.grid import Grid, Window, bounds_in, grid_from_bounds, read_crs
@@ -214,7 +214,9 @@ def _observe(path, image_grid, grid, heights, tables, body):
     if window.is_empty:
         raise GeometryError(f"{path.name} does not overlap the output grid.")
     positions = [find_position(table, path.name, source) for source, table in tables]
-    measured = read_on_grid(path, grid.cut(window), body)
+    measured = read_image_on_grid(path, grid.cut(window), body)
+    if not np.isfinite(measured).any():
+        raise GeometryError(f"{path.name} holds no brightness: all is shadow, clipped or no data.")
     if not (np.isfinite(measured) & np.isfinite(heights[window.slices])).any():
         raise GeometryError(f"{path.name} has no valid pixel where the DEM is known.")
     info = raster_info(path, body)

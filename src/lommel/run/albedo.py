@@ -1,0 +1,144 @@
+"""The stage `lommel albedo`: images, positions and DEMs in, albedo map and exposures out.
+
+Most callers want `run_albedo`.
+"""
+
+import csv
+from dataclasses import asdict, replace
+
+import numpy as np
+
+from lommel.estimate.albedo import AlbedoSettings, estimate_albedo, published_settings
+from lommel.estimate.albedo_quality import (
+    brightness_ramp,
+    shading_in_albedo,
+    slope_towards_sun,
+)
+from lommel.io.raster import write_raster
+from lommel.run.inputs import GridSettings, SceneFiles, Skipped, read_scene
+from lommel.run.products import RunRecord, output_folder
+
+
+def albedo_settings(solver="projection", shadow_threshold=None, **changes):
+    """Settings from options; what is left out or None follows the solver.
+
+    Parameters
+    ----------
+    solver : {'projection', 'alternating'}
+        The alternating solver brings the settings of the published iteration with it.
+    shadow_threshold : float, image units, or None
+    **changes
+        Fields of `AlbedoSettings`.
+
+    Returns
+    -------
+    settings : AlbedoSettings
+
+    Examples
+    --------
+    >>> albedo_settings().loss, albedo_settings("alternating").loss
+    ('cauchy', 'least-squares')
+    """
+    start = published_settings() if solver == "alternating" else AlbedoSettings(solver=solver)
+    chosen = {name: value for name, value in changes.items() if value is not None}
+    return replace(start, masks=replace(start.masks, shadow_threshold=shadow_threshold), **chosen)
+
+
+def run_albedo(
+    files: SceneFiles,
+    output,
+    settings: AlbedoSettings | None = None,
+    grid_settings: GridSettings | None = None,
+    overwrite: bool = False,
+    progress=iter,
+):
+    """Estimate albedo and exposures from orthoimages and write the products.
+
+    Parameters
+    ----------
+    files : SceneFiles
+    output : path
+        Folder that appears when the run is done.
+    settings : AlbedoSettings, optional
+    grid_settings : GridSettings, optional
+    overwrite : bool
+    progress : callable
+        Wraps the iterable of images.
+
+    Returns
+    -------
+    results : dict of str to number
+        As in ``run.json``.
+    """
+    settings = settings or AlbedoSettings()
+    record = RunRecord(
+        "albedo", asdict(settings) | {"grid": asdict(grid_settings or GridSettings())}
+    )
+    with output_folder(output, overwrite) as folder:
+        with record.stage("read"):
+            scene = read_scene(files, grid_settings, prefer="images", progress=progress)
+            record.add_inputs([*files.images, *files.dems])
+            record.add_inputs([files.sun_positions, files.spacecraft_positions])
+        with record.stage("solve"):
+            result = estimate_albedo(scene.observations, scene.grid, scene.heights, settings)
+        with record.stage("write"):
+            names = [observation.name for observation in scene.observations]
+            reasons = zip(names, result.reasons, strict=True)
+            unused = [Skipped(name, f"{name}: {reason}") for name, reason in reasons if reason]
+            record.add_skipped([*scene.skipped, *unused])
+            _write_rasters(folder, scene.grid, result)
+            _write_exposures(folder / "exposures.csv", names, result, scene.skipped)
+        record.results = _results(scene, result)
+        record.history = result.history
+        record.outcome = {"name": result.outcome, "sentence": result.advice}
+        record.write(folder)
+    return record.results
+
+
+def _write_rasters(folder, grid, result):
+    write_raster(folder / "albedo.tif", result.albedo, grid, "albedo, mean exposure 1", "1")
+    write_raster(folder / "orthomosaic.tif", result.orthomosaic, grid, "mean image value")
+    write_raster(folder / "count.tif", result.count.astype(np.uint16), grid, "images used")
+    error = 100.0 * result.albedo_error / result.albedo
+    write_raster(folder / "residual.tif", error, grid, "standard error of the albedo", "percent")
+
+
+def _write_exposures(path, names, result, skipped):
+    header = ["image", "exposure", "exposure_error", "haze", "haze_error", "used", "reason"]
+    table = zip(
+        names,
+        result.exposures,
+        result.exposure_errors,
+        result.hazes,
+        result.haze_errors,
+        result.reasons,
+        strict=True,
+    )
+    with open(path, "w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        for name, *numbers, reason in table:
+            values = ["" if reason else f"{float(number):.8g}" for number in numbers]
+            writer.writerow([name, *values, 0 if reason else 1, reason])
+        for skip in skipped:
+            writer.writerow([skip.name, "", "", "", "", 0, skip.reason])
+
+
+def _results(scene, result):
+    """Numbers of the run; see `lommel.estimate.albedo_quality` for what they mean."""
+    used = [not reason for reason in result.reasons]
+    suns = [o.sun_position for o, is_used in zip(scene.observations, used, strict=True) if is_used]
+    slope = slope_towards_sun(scene.grid, scene.heights, suns)
+    correlation, _ = shading_in_albedo(result.albedo, slope)
+    error = result.albedo_error / result.albedo
+    return {
+        "images": int(np.sum(used)),
+        "disagreement_before_percent": 100.0 * result.disagreement_before,
+        "disagreement_after_percent": 100.0 * result.disagreement,
+        "albedo_error_percent": 100.0 * float(np.nanmedian(error)),
+        "brightness_ramp_percent": 100.0 * brightness_ramp(result.albedo, result.count),
+        "shading_correlation": correlation,
+        "noise_percent": 100.0 * result.noise,
+        "pixels_per_independent_residual": result.repetition,
+        **result.shared,
+    }
