@@ -96,9 +96,9 @@ def map_grid(settings, margin=0):
         f"+R={MOON.radius} +units=m +type=crs"
     )
     rows, cols = settings.rows + 2 * margin, settings.cols + 2 * margin
-    left = settings.east - 0.5 * cols * settings.spacing
-    top = map_north(settings) + settings.north + 0.5 * rows * settings.spacing
-    affine = Affine(settings.spacing, 0.0, left, 0.0, -settings.spacing, top)
+    left = np.round(settings.east / settings.spacing - 0.5 * cols)
+    top = np.round((map_north(settings) + settings.north) / settings.spacing + 0.5 * rows)
+    affine = Affine.scale(settings.spacing, -settings.spacing) @ Affine.translation(left, -top)
     return Grid((rows, cols), affine, crs, MOON)
 
 

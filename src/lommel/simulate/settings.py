@@ -21,7 +21,7 @@ class GridSettings:
     longitude_deg, latitude_deg : float, deg
         Origin of the map.
     east, north : float, m
-        Centre of the grid.
+        Centre of the grid; moved so that pixel edges are whole spacings, as maps have them.
     rows, cols : int
     spacing : float, m
     """
