@@ -50,6 +50,8 @@ from lommel.estimate.shading_kernels import (
 COARSEST = 24  # posts along the shorter side of the coarsest level that sees the images
 COARSE_STEPS = 2  # Gauss-Newton steps per coarse level
 SLOPE_STEP = 0.01  # for the change of brightness with slope: R bends little over half a degree
+HOLD = 100.0  # how much stiffer known heights are held than the plate that closes holes
+FILL_REDUCTION, FILL_CYCLES = 1e-3, 60
 HUBER_SCALE = 3.0  # noise standard errors from which a residual counts as an outlier
 
 
@@ -320,7 +322,7 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
         Its value is a `SurfaceSolution`.
     """
     settings = settings or SolverSettings()
-    finest = _finest_problem(surface, initial, views, model, albedo)
+    finest = fresh_problem(surface, initial, views, model, albedo)
     finest.prepare_geometry(finest.initial)
     _sample_images(finest, finest.initial)
     _fit_exposures(finest)
@@ -407,7 +409,8 @@ def _best_exposures(sums, exposures):
     return np.where(has_data, sums[:, SUM_FM] / np.where(has_data, sums[:, SUM_FF], 1), exposures)
 
 
-def _finest_problem(surface, initial, views, model, albedo):
+def fresh_problem(surface, initial, views, model, albedo):
+    """The finest level before images are sampled and priors known; see `solve_surface`."""
     rows, cols = initial.shape
     count = len(views)
     if albedo is None:
@@ -486,7 +489,7 @@ def _estimate_priors(level):
 
 
 def fill_holes(heights):
-    """Heights with holes filled smoothly from their surroundings, coarse to fine.
+    """Heights whose holes are closed by the thin plate through their surroundings.
 
     Parameters
     ----------
@@ -499,16 +502,35 @@ def fill_holes(heights):
     known = np.isfinite(heights)
     if known.all():
         return heights
+    start = _pull_push(heights)
+    rows, cols = heights.shape
+    none = np.zeros((rows - 1, cols - 1), np.float32)
+    plate = np.array([1.0, 2.0, 1.0], np.float32)
+    posts = np.where(known, np.float32(HOLD), np.float32(0))
+    bending = np.empty_like(start)
+    with threads_for(start.shape):
+        massless = np.zeros((1, cols), np.float32)
+        apply_operator(start, none, none, none, plate, np.float32(0), massless, bending)
+    equations = NormalEquations((none, none, none), plate, [0.0], posts)
+    change = conjugate_gradients(equations, -bending, FILL_REDUCTION, FILL_CYCLES).x
+    return np.where(known, heights, start + change)
+
+
+def _pull_push(heights):
+    """Holes filled with means of known posts around, from coarse grids."""
+    known = np.isfinite(heights)
+    if known.all():
+        return heights
     if min(heights.shape) <= 2:
         return np.where(known, heights, np.nanmean(heights)).astype(np.float32)
     total = np.zeros(coarse_shape(heights.shape), np.float32)
     weight = np.zeros_like(total)
     restrict(np.where(known, heights, np.float32(0)).astype(np.float32), total)
     restrict(known.astype(np.float32), weight)
-    with np.errstate(invalid="ignore"):
-        coarse = fill_holes(np.where(weight > 0, total / weight, np.float32(np.nan)))
+    missing = weight == 0
+    coarse = _pull_push(np.where(missing, np.nan, total / np.where(missing, 1, weight)))
     filled = np.zeros_like(heights)
-    prolong_add(coarse, filled)
+    prolong_add(coarse.astype(np.float32), filled)
     return np.where(known, heights, filled)
 
 
