@@ -138,8 +138,8 @@ class AlbedoResult:
     hazes, haze_errors : float64 array (images,), image units
     reasons : tuple of str
         Why an image was not used; empty where it was.
-    shared : dict of str to float
-        c1 (per rad), c2, v2 (per rad^2) and v4 (per rad^4), with their standard errors.
+    shared, shared_errors : float64 array (4,)
+        c1 (per rad), c2, v2 (per rad^2) and v4 (per rad^4); error NaN where not fitted.
     groups : tuple of tuple of int
         Images connected by overlap; the scale between two groups is set by the prior alone.
     disagreement_before, disagreement : float
@@ -161,7 +161,8 @@ class AlbedoResult:
     hazes: np.ndarray
     haze_errors: np.ndarray
     reasons: tuple[str, ...]
-    shared: dict
+    shared: np.ndarray
+    shared_errors: np.ndarray
     groups: tuple[tuple[int, ...], ...]
     disagreement_before: float
     disagreement: float
@@ -515,6 +516,10 @@ def _published_step(problem, point):
 def _result(problem, point, reasons, history, outcome, advice):
     """Bring the gauge to mean exposure 1, and collect."""
     used = np.array([not reason for reason in reasons])
+    point.scale, point.repetition = (
+        noise_scale(point.sums.histogram),
+        effective_repetition(point.sums),
+    )
     state, maps = point.state, point.maps
     gauge = state.exposure.mean()
     errors = _standard_errors(problem, point)
@@ -525,9 +530,6 @@ def _result(problem, point, reasons, history, outcome, advice):
         everyone[used] = values
         return everyone
 
-    names = ("phase_c1_per_rad", "phase_c2", "falloff_v2_per_rad2", "falloff_v4_per_rad4")
-    shared = dict(zip(names, state.shared.tolist(), strict=True))
-    shared |= {f"{n}_error": float(e) for n, e in zip(names, errors[-SHARED - 1 : -1], strict=True)}
     seen = maps.count > 0
     groups = _groups(problem, point)
     indices = np.flatnonzero(used)
@@ -541,7 +543,10 @@ def _result(problem, point, reasons, history, outcome, advice):
         hazes=per_image(state.haze),
         haze_errors=per_image(state.level * own[:, 1]),
         reasons=tuple(reasons),
-        shared=shared,
+        shared=state.shared,
+        shared_errors=np.where(
+            problem.is_fitted[-SHARED - 1 : -1], errors[-SHARED - 1 : -1], np.nan
+        ),
         groups=tuple(tuple(indices[group].tolist()) for group in groups),
         disagreement_before=disagreement(problem.samples, problem.shape),
         disagreement=disagreement(

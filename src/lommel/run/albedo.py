@@ -18,6 +18,8 @@ from lommel.io.raster import write_raster
 from lommel.run.inputs import GridSettings, SceneFiles, Skipped, read_scene
 from lommel.run.products import RunRecord, output_folder
 
+SHARED_NAMES = ("phase_c1_per_rad", "phase_c2", "falloff_v2_per_rad2", "falloff_v4_per_rad4")
+
 
 def albedo_settings(solver="projection", shadow_threshold=None, **changes):
     """Settings from options; what is left out or None follows the solver.
@@ -136,9 +138,15 @@ def _results(scene, result):
         "disagreement_before_percent": 100.0 * result.disagreement_before,
         "disagreement_after_percent": 100.0 * result.disagreement,
         "albedo_error_percent": 100.0 * float(np.nanmedian(error)),
-        "brightness_ramp_percent": 100.0 * brightness_ramp(result.albedo, result.count),
+        "brightness_ramp_percent": 100.0 * np.expm1(brightness_ramp(result.albedo, result.count)),
         "shading_correlation": correlation,
         "noise_percent": 100.0 * result.noise,
         "pixels_per_independent_residual": result.repetition,
-        **result.shared,
+        **{
+            name: float(value)
+            for name, value, error in zip(
+                SHARED_NAMES, result.shared, result.shared_errors, strict=True
+            )
+            if np.isfinite(error)
+        },
     }
