@@ -13,11 +13,13 @@ from affine import Affine
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
-from lommel.errors import InputError
+from lommel.errors import GeometryError, InputError
 from lommel.scene.body import MOON, Body, to_xyz
 
 RADIUS_TOLERANCE = 0.005  # share; the Moon's own radii (1735-1738 km) pass, no other body does
 SAME_POST = 1e-3  # post spacings; grids closer than this count as one
+LATTICE = 33  # points along each side that stand for a grid's area
+LEAST_SPACING = 1e-3  # m, far below any image of a planet
 
 
 @dataclass(frozen=True)
@@ -135,13 +137,14 @@ class Grid:
 
         Returns
         -------
-        row, col : array (...), posts. Not finite where the projection does not reach.
+        row, col : array (...), posts. NaN where the projection does not reach.
         """
         longitude = np.degrees(np.asarray(longitude, float))
         latitude = np.degrees(np.asarray(latitude, float))
         transformer = _to_geodetic(self.crs.to_wkt())
         x, y = transformer.transform(longitude, latitude, direction="INVERSE")
-        col, row = ~self.affine @ (np.asarray(x), np.asarray(y))
+        reached = np.isfinite(x) & np.isfinite(y)
+        col, row = ~self.affine @ (np.where(reached, x, np.nan), np.where(reached, y, np.nan))
         if self.crs.is_geographic:  # the same meridian may be written 360 degrees away
             turn = 360.0 / self.affine.a
             col = col - turn * np.round((col - self.shape[1] / 2) / turn)
@@ -164,14 +167,29 @@ class Grid:
         """
         return to_xyz(self.body, *self.lonlat(), heights)
 
+    def outline(self):
+        """Points that span the grid's area: a lattice out to its edges, and the poles inside it.
+
+        Returns
+        -------
+        longitude, latitude : array (n,), rad; not finite where the projection does not reach
+        """
+        rows, cols = self.shape
+        share = np.linspace(0.0, 1.0, LATTICE)
+        lattice = np.stack(self.lonlat_at(share[:, None] * rows - 0.5, share * cols - 0.5))
+        points = [lattice.reshape(2, -1)]
+        for pole in (-np.pi / 2, np.pi / 2):
+            row, col = self.index_at(0.0, pole)
+            if abs(row - (rows - 1) / 2) <= rows / 2 and abs(col - (cols - 1) / 2) <= cols / 2:
+                longitude = np.linspace(-np.pi, np.pi, LATTICE)
+                points.append(np.stack([longitude, np.full(LATTICE, pole)]))
+        return tuple(np.concatenate(points, axis=1))
+
     def footprint(self, other):
         """The window of ``other`` that this grid's area touches; empty when apart."""
-        rows, cols = self.shape
-        edge = np.linspace(0.0, 1.0, 33)
-        row = np.concatenate([0 * edge, 0 * edge + 1, edge, edge]) * rows - 0.5
-        col = np.concatenate([edge, edge, 0 * edge, 0 * edge + 1]) * cols - 0.5
-        there = np.stack(other.index_at(*self.lonlat_at(row, col)))
-        if not np.isfinite(there).all():
+        there = np.stack(other.index_at(*self.outline()))
+        there = there[:, np.isfinite(there).all(axis=0)]
+        if there.size == 0:
             return Window(0, 0, 0, 0)
         first = np.floor(there.min(axis=1)).astype(int)
         size = np.ceil(there.max(axis=1)).astype(int) - first + 1
@@ -252,13 +270,15 @@ def grid_from_bounds(bounds, spacing, crs, body=MOON):
     grid : Grid
     """
     xmin, ymin, xmax, ymax = bounds
-    if not (xmax > xmin and ymax > ymin):
+    if not (np.isfinite(bounds).all() and xmax > xmin and ymax > ymin):
         raise InputError(
-            f"bounds = {xmin:g} {ymin:g} {xmax:g} {ymax:g} are empty. "
+            f"bounds = {xmin:g} {ymin:g} {xmax:g} {ymax:g} are empty or not finite. "
             "Give xmin ymin xmax ymax with xmin < xmax and ymin < ymax, in units of the CRS."
         )
-    if not spacing > 0:
-        raise InputError(f"spacing = {spacing} is not positive. Give the post spacing in metres.")
+    if not LEAST_SPACING <= spacing < np.inf:
+        raise InputError(
+            f"spacing = {spacing} is not a post spacing. Give metres, {LEAST_SPACING:g} or more."
+        )
     step = spacing / metres_per_unit(crs, body)
     first_col, last_row = np.floor(xmin / step + 1e-6), np.floor(ymin / step + 1e-6)
     cols = int(np.ceil(xmax / step - 1e-6) - first_col)
@@ -275,5 +295,9 @@ def metres_per_unit(crs, body=MOON):
 
 def bounds_in(grid, crs):
     """Bounds of a grid in another CRS: xmin, ymin, xmax, ymax, in that CRS's units."""
-    transformer = Transformer.from_crs(grid.crs, crs, always_xy=True)
-    return transformer.transform_bounds(*grid.bounds, densify_pts=33)
+    points = _to_geodetic(crs.to_wkt()).transform(*np.degrees(grid.outline()), direction="INVERSE")
+    there = np.stack(points)
+    there = there[:, np.isfinite(there).all(axis=0)]
+    if there.size == 0:
+        raise GeometryError(f"The CRS {crs.name!r} does not reach the raster's area.")
+    return *there.min(axis=1).tolist(), *there.max(axis=1).tolist()
