@@ -1,0 +1,108 @@
+"""`lommel info`: what a raster holds, where it lies, how it is lit and seen.
+
+Most callers want `describe`.
+"""
+
+import numpy as np
+
+from lommel.io.positions import find_position, read_positions
+from lommel.io.raster import raster_info
+from lommel.scene.body import MOON, local_frame, to_lonlat, to_xyz
+from lommel.scene.geometry import unit, viewing_geometry
+
+DECIMALS_DEG = 6  # 3 cm on the Moon
+DECIMALS_M = 3
+
+
+def describe(path, sun_positions=None, spacecraft_positions=None, body=MOON):
+    """Facts about a raster, by name; names carry the unit.
+
+    Parameters
+    ----------
+    path : path
+        Any raster GDAL reads; one without a CRS has no place, so only its pixels are described.
+    sun_positions, spacecraft_positions : path, optional
+        Position tables. With the Sun come the subsolar point and the light at the image's centre,
+        with the spacecraft the subspacecraft point and the view, with both the phase.
+    body : Body
+
+    Returns
+    -------
+    facts : dict of str to str, int, float or None
+        Angles at the centre are those on the sphere; azimuth is clockwise from north.
+    """
+    info = raster_info(path, body)
+    facts = {
+        "file": str(path),
+        "rows": info.shape[0],
+        "cols": info.shape[1],
+        "bands": info.bands,
+        "dtype": info.dtype,
+        "nodata": info.nodata,
+        "mask": "second band" if info.has_mask_band else None,
+        "crs": info.grid.crs.name if info.grid else None,
+    }
+    if info.grid:
+        facts |= _place(info.grid)
+    sun, spacecraft = (
+        None
+        if table is None
+        else find_position(read_positions(table, kind, body), info.path.name, table)
+        for table, kind in ((sun_positions, "sun"), (spacecraft_positions, "spacecraft"))
+    )
+    if sun is not None:
+        facts |= _point("subsolar", body, sun)
+    if spacecraft is not None:
+        facts |= _point("subspacecraft", body, spacecraft)
+        altitude = to_lonlat(body, spacecraft)[2]
+        facts["spacecraft_altitude_m"] = round(float(altitude), DECIMALS_M)
+    if info.grid:
+        facts |= _angles(info.grid, sun, spacecraft)
+    return facts
+
+
+def _place(grid):
+    longitude, latitude = (angle[np.isfinite(angle)] for angle in grid.outline())
+    rows, cols = grid.shape
+    middle = np.array(grid.lonlat_at((rows - 1) / 2, (cols - 1) / 2))
+    longitude = middle[0] + np.angle(np.exp(1j * (longitude - middle[0])))  # across any meridian
+    return {
+        "gsd_m": round(max(grid.spacing), DECIMALS_M),
+        "longitude_deg": _degrees(middle[0]),
+        "latitude_deg": _degrees(middle[1]),
+        "longitude_west_deg": _degrees(longitude.min()),
+        "longitude_east_deg": _degrees(longitude.max()),
+        "latitude_south_deg": _degrees(latitude.min()),
+        "latitude_north_deg": _degrees(latitude.max()),
+    }
+
+
+def _point(name, body, position):
+    longitude, latitude, _ = to_lonlat(body, position)
+    return {
+        f"{name}_longitude_deg": _degrees(longitude),
+        f"{name}_latitude_deg": _degrees(latitude),
+    }
+
+
+def _angles(grid, sun, spacecraft):
+    """Light and view at the grid's centre, for a surface that follows the sphere."""
+    longitude, latitude = grid.lonlat_at((grid.shape[0] - 1) / 2, (grid.shape[1] - 1) / 2)
+    ground = to_xyz(grid.body, longitude, latitude, 0.0)
+    east, north, up = local_frame(longitude, latitude)
+    facts = {}
+    if sun is not None:
+        to_sun = unit(sun - ground)
+        elevation = np.arcsin(to_sun @ up)
+        facts["sun_azimuth_deg"] = _degrees(np.arctan2(to_sun @ east, to_sun @ north) % (2 * np.pi))
+        facts["sun_elevation_deg"] = _degrees(elevation)
+        facts["incidence_deg"] = _degrees(np.pi / 2 - elevation)
+    if spacecraft is not None:
+        facts["emission_deg"] = _degrees(np.arccos(unit(spacecraft - ground) @ up))
+    if sun is not None and spacecraft is not None:
+        facts["phase_deg"] = _degrees(viewing_geometry(ground, up, sun, spacecraft).phase)
+    return facts
+
+
+def _degrees(angle):
+    return round(float(np.degrees(angle)), DECIMALS_DEG)
