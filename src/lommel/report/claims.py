@@ -9,6 +9,9 @@ import numpy as np
 
 from lommel.report import drawing, plots
 
+UNUSED = "shadow, clipped or no data"
+BY_MEDIAN = "brightness, median of the map = 1"
+
 
 @dataclass(frozen=True)
 class Panel:
@@ -62,6 +65,7 @@ def find_claims(contents):
         relief_before_and_after,
         measured_against_modelled,
         height_and_change,
+        albedo_of_terrain,
         exposures_of_images,
         coverage_and_residual,
         convergence,
@@ -73,22 +77,20 @@ def find_claims(contents):
 def albedo_against_mosaic(contents):
     """Brightness of the plain mosaic and the albedo, each by its own median, on one scale."""
     before, after = contents.preview("orthomosaic.tif"), contents.preview("albedo.tif")
-    if after is None:
+    if before is None or after is None:
         return None
-    pair = [_by_median(before), _by_median(after)] if before else [_by_median(after)]
-    limits = drawing.percent_clipped(*[preview.values for preview in pair])
-    titles = ("Before: plain mosaic", "After: albedo")[-len(pair) :]
-    names = ("orthomosaic", "albedo")[-len(pair) :]
-    panels = [
-        _map(preview, name, title, "brightness, median of the map = 1", "gray", limits)
-        for preview, name, title in zip(pair, names, titles, strict=True)
-    ]
+    before, after = _by_median(before), _by_median(after)
+    limits = drawing.percent_clipped(before.values, after.values)
+    look = (BY_MEDIAN, "gray", limits, UNUSED)
     return Claim(
         "Albedo without relief and exposure",
-        "Each map is divided by its own median; both have the same grey scale, clipped at 1 and "
-        "99 per cent. In the albedo, slopes and borders of images should be gone and the "
-        "brightness of the ground itself should stay.",
-        tuple(panels),
+        "Each map is divided by its own median; both have the same grey scale. In the albedo, "
+        "slopes and borders of images should be gone and the brightness of the ground itself "
+        "should stay.",
+        (
+            _map(before, "orthomosaic", "Before: plain mosaic", *look),
+            _map(after, "albedo", "After: albedo", *look),
+        ),
         drawing.is_wide(after.grid),
     )
 
@@ -123,19 +125,18 @@ def measured_against_modelled(contents):
     if measured is None or modelled is None or measured.values.shape != modelled.values.shape:
         return None
     limits = drawing.percent_clipped(measured.values, modelled.values)
-    unused = "shadow, clipped or no data"
     panels = [
-        _map(measured, "measured", "Measured image", "image value", "gray", limits, unused),
-        _map(modelled, "modelled", "Modelled image", "image value", "gray", limits, unused),
+        _map(measured, "measured", "Measured image", "image value", "gray", limits, UNUSED),
+        _map(modelled, "modelled", "Modelled image", "image value", "gray", limits, UNUSED),
     ]
     typical = _median(measured.values)
     difference = replace(modelled, values=100 * (modelled.values - measured.values) / typical)
-    panels += _difference_panels(difference, unused)
+    panels += _difference_panels(difference)
     residual = contents.preview("residual.tif")
     if residual is not None and contents.record["results"].get("images", 1) > 1:
         title, label = "All images", f"rms residual, {residual.unit}"
         limits = (0.0, drawing.percent_clipped(residual.values)[1])
-        panels.append(_map(residual, "residual", title, label, "cividis", limits, unused))
+        panels.append(_map(residual, "residual", title, label, "cividis", limits, UNUSED))
     text = (
         "The first image, on the same grey scale measured and modelled. The difference is modelled "
         "minus measured in per cent of the median image value; relief that shows in it is relief "
@@ -164,6 +165,22 @@ def height_and_change(contents):
     return Claim("Heights and what changed", text, tuple(panels), drawing.is_wide(dem.grid))
 
 
+def albedo_of_terrain(contents):
+    """What shape from shading gave to the ground's brightness instead of to its slopes."""
+    albedo = contents.preview("albedo.tif")
+    if albedo is None or contents.preview("dem.tif") is None:
+        return None
+    albedo = _by_median(albedo)
+    limits = drawing.percent_clipped(albedo.values)
+    return Claim(
+        "Brightness that is not relief",
+        "The albedo estimated with the terrain, by its median. Craters lit from one side in it "
+        "would be relief taken for albedo.",
+        (_map(albedo, "albedo", "Albedo", BY_MEDIAN, "gray", limits, UNUSED),),
+        drawing.is_wide(albedo.grid),
+    )
+
+
 def exposures_of_images(contents):
     """Exposure and haze of each image along the strip."""
     exposures = contents.exposures
@@ -183,13 +200,17 @@ def coverage_and_residual(contents):
         seen = replace(count, values=np.where(count.values > 0, count.values, np.nan))
         limits = (0.0, max(float(np.nanmax(seen.values, initial=1.0)), 1.0))
         title, label = "Images per point", "images used at a point"
-        panels.append(_map(seen, "count", title, label, "cividis", limits, whole_numbers=True))
+        panels.append(
+            _map(seen, "count", title, label, "cividis", limits, UNUSED, whole_numbers=True)
+        )
     residual = contents.preview("residual.tif") if count is not None else None
     if residual is not None:
         limits = (0.0, drawing.percent_clipped(residual.values)[1])
         unit = residual.unit.replace("percent", "%")
         label = "standard error" + (f", {unit}" if unit not in ("", "1") else "")
-        panels.append(_map(residual, "residual", "Error of the albedo", label, "cividis", limits))
+        panels.append(
+            _map(residual, "residual", "Error of the albedo", label, "cividis", limits, UNUSED)
+        )
     text = "An albedo is as good as the images that agree on it: many images, small error."
     wide = bool(panels) and drawing.is_wide((count or residual).grid)
     return Claim("Where the albedo is well known", text, tuple(panels), wide)
@@ -201,17 +222,20 @@ def convergence(contents):
     if png is None:
         return None
     text = "The cost should fall and level off; a run that still falls stopped too early."
-    if any("stride" in row for row in contents.record["history"]):
+    history = contents.record["history"]
+    if any("stride" in row for row in history):
         text += " Coarse levels come first: 1/8 is solved on every eighth post, on fewer cells."
+    if len({row.get("noise") for row in history}) > 1:
+        text += " Grey: the noise, in which the cost is counted, was still being estimated."
     words = "Cost after each step of the solver"
     return Claim("Convergence", text, (Panel("convergence", png, words),))
 
 
-def _difference_panels(difference, unused):
+def _difference_panels(difference):
     label = "difference, % of the median"
     limits = drawing.about_zero(difference.values)
     title = "Modelled minus measured"
-    panels = [_map(difference, "image-difference", title, label, "RdBu_r", limits, unused)]
+    panels = [_map(difference, "image-difference", title, label, "RdBu_r", limits, UNUSED)]
     png = plots.draw_histogram(difference.values, label)
     if png:
         panels.append(Panel("image-difference-histogram", png, f"Histogram of the {label}"))

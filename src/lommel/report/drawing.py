@@ -130,7 +130,7 @@ def draw_map(
         return to_png(figure)
 
 
-def percent_clipped(*arrays, low=1.0, high=99.0):
+def percent_clipped(*arrays, low=0.5, high=99.5):
     """Limits that leave the darkest and brightest per cent out, common to all arrays.
 
     Parameters

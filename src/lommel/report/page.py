@@ -14,32 +14,14 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from lommel.errors import InputError
 from lommel.report.claims import Claim, find_claims
 from lommel.report.contents import Contents, read_contents
+from lommel.report.words import Quantity, format_number, in_words, quantities_of
 
 TITLES = {
     "albedo": "Albedo and exposures",
     "sfs": "Terrain refined by shape from shading",
     "demo": "Demonstration: a simulated orbit strip",
 }
-UNITS = {"m": "m", "deg": "°", "percent": "%", "px": "px", "km": "km", "s": "s", "mb": "MB"}
-CAPITALS = {"rms": "RMS", "rmse": "RMSE", "mae": "MAE", "nmad": "NMAD", "dem": "DEM", "gsd": "GSD"}
 HEADLINES = 6  # results shown large before the table
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """A result as people read it.
-
-    Attributes
-    ----------
-    words, value, unit : str
-    target : str
-        The value not to be exceeded, or to be reached; empty where none was set.
-    """
-
-    words: str
-    value: str
-    unit: str
-    target: str = ""
 
 
 @dataclass(frozen=True)
@@ -87,66 +69,11 @@ def build_page(folder):
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(inline=_inline, flat=_flat, number=format_number, words=_in_words)
+    environment.filters.update(inline=_inline, flat=_flat, number=format_number, words=in_words)
     html = environment.get_template("page.html.j2").render(parts=parts, headlines=HEADLINES)
     page = folder / "report.html"
     _write(page, html.encode("utf-8", "replace"))
     return page
-
-
-def quantities_of(results, targets):
-    """Results in words, those with a unit first.
-
-    The end of a name is its unit; ``..._before`` and ``..._after`` become one line.
-
-    Parameters
-    ----------
-    results : dict of str to number
-    targets : dict of str to number
-        For some of the results, the value not to be exceeded.
-
-    Returns
-    -------
-    quantities : list of Quantity
-
-    Examples
-    --------
-    >>> quantities_of({"height_rmse_before_m": 2.74, "height_rmse_after_m": 0.13712}, {})[0]
-    Quantity(words='height RMSE', value='2.74 → 0.1371', unit='m', target='')
-    """
-    quantities = []
-    for name, value in results.items():
-        before, after = name.replace("_after", "_before"), name.replace("_before", "_after")
-        shown, is_pair = format_number(value), before != after and {before, after} <= set(results)
-        if is_pair and name == before:
-            continue  # said together with the value after
-        if is_pair:
-            shown = f"{format_number(results[before])} → {shown}"
-        plain_name = name.replace("_after", "") if is_pair else name
-        stem, _, end = plain_name.rpartition("_")
-        unit = UNITS.get(end, "") if stem else ""
-        words = _in_words(stem if unit else plain_name)
-        quantities.append(Quantity(words, shown, unit, str(targets.get(name, ""))))
-    return sorted(quantities, key=lambda quantity: not quantity.unit)
-
-
-def format_number(value):
-    """A number with four digits that matter; everything else as it is.
-
-    Examples
-    --------
-    >>> format_number(0.000123456), format_number(12345678), format_number(None)
-    ('0.0001235', '12 345 678', '–')
-    """
-    if value is None:
-        return "–"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, int):
-        return f"{value:,}".replace(",", " ")
-    if isinstance(value, float):
-        return f"{value:.4g}" if abs(value) < 1e4 else f"{value:,.0f}".replace(",", " ")
-    return str(value)
 
 
 def _part(contents):
@@ -172,10 +99,6 @@ def _flat(values):
     for name, value in values.items():
         flat.update(_flat(value) if isinstance(value, dict) else {name: value})
     return flat
-
-
-def _in_words(name):
-    return " ".join(CAPITALS.get(word, word) for word in str(name).split("_"))
 
 
 def _inline(png):

@@ -15,6 +15,8 @@ from lommel.report.drawing import (
     to_png,
 )
 
+UNSETTLED = "#b8bec7"
+STEP_SIZES = {"step_m": "step, m", "change": "relative change"}
 NAMED_IMAGES = 60  # images up to which each one is named on the axis
 NAME_LENGTH = 24  # characters of an image's name on the axis
 PLAIN = FuncFormatter(lambda value, _: f"{value:.6g}")  # powers of ten would need math text
@@ -57,13 +59,16 @@ def draw_exposures(exposures):
 
 
 def draw_history(history):
-    """Cost and size of each step; levels of a coarse-to-fine solve are drawn apart.
+    """Cost and size of each step.
+
+    Costs on different levels of a coarse-to-fine solve, or under another noise, are not comparable:
+    they are drawn apart, and in grey while the noise is not yet the final one.
 
     Parameters
     ----------
     history : list of dict
-        Each with a ``cost``; where known, with ``change`` (relative) or ``step_m``, and with
-        ``stride``, the posts per step of the level.
+        Each with a ``cost``; where known, with ``change`` (relative) or ``step_m``, with the
+        ``stride`` of the level in posts, and with the ``noise`` that the cost is counted in.
 
     Returns
     -------
@@ -73,24 +78,24 @@ def draw_history(history):
     if len(rows) < 2:
         return None
     steps, cost = np.arange(1, len(rows) + 1), np.array([row["cost"] for row in rows], float)
-    strides = np.array([row.get("stride", 1) for row in rows])
-    sizes = {"step_m": "step, m", "change": "relative change"}
+    kinds = [(row.get("stride"), row.get("noise")) for row in rows]
     with styled():
         figure = new_figure(PANEL_WIDTH, 3.4)
         axes = figure.add_subplot()
-        for stride in dict.fromkeys(strides.tolist()):
-            level = strides == stride
-            axes.plot(steps[level], cost[level], color=ACCENT, marker="o", markersize=4)
-            if len(set(strides)) > 1:
+        for stride, noise in dict.fromkeys(kinds):
+            kind = np.array([other == (stride, noise) for other in kinds])
+            colour = ACCENT if noise == kinds[-1][1] else UNSETTLED
+            axes.plot(steps[kind], cost[kind], color=colour, marker="o", markersize=4)
+            if stride is not None:
                 note = {"xytext": (0, 7), "textcoords": "offset points", "fontsize": 7}
-                axes.annotate(f"1/{stride}", (steps[level][0], cost[level][0]), **note)
+                axes.annotate(f"1/{stride}", (steps[kind][0], cost[kind][0]), **note)
         axes.set(title="Cost after each step", xlabel="step", ylabel="cost")
         axes.set_yscale("log" if cost.min() > 0 and cost.max() > 3 * cost.min() else "linear")
         axes.yaxis.set_major_formatter(PLAIN)
         axes.yaxis.set_minor_formatter(NullFormatter())
         axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
         axes.margins(y=0.12)
-        for key, label in sizes.items():
+        for key, label in STEP_SIZES.items():
             size = np.array([_positive(row.get(key)) for row in rows])
             if np.isfinite(size).any():
                 _draw_sizes(axes, steps, size, label)
