@@ -14,310 +14,20 @@ of the image's level) and by the shared ones (c1, c2, v2, v4). Loops run along r
 sums are kept per block of rows, so that results do not depend on the number of threads.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit, prange
 
-BLOCKS = 32  # blocks of rows, fixed so that sums do not depend on the number of threads
-OWN = 2  # parameters of one image: log exposure, haze
-SHARED = 4  # parameters of all images: c1, c2, v2, v4
-PATCHES = 8  # patches along each side of an image, in which residuals are summed
-SCALE_BINS, SCALE_LOW, SCALE_STEP = 512, -14.0, 1.0 / 32.0  # of log2 |residual|, up to 2^2
-LEAST_SQUARES, HUBER, CAUCHY = 0, 1, 2
-HUBER_TUNING, CAUCHY_TUNING = 1.345, 2.385  # 95 % efficient on Gaussian noise (Holland & Welsch)
-
-
-class Samples(NamedTuple):
-    """Pixels of all images, one image after the other, each row by row.
-
-    Attributes
-    ----------
-    windows : int64 array (images, 4)
-        First row, first column, rows and columns of each image in the grid.
-    starts : int64 array (images,)
-        Index of each image's first pixel in the arrays below.
-    measured : float32 array (pixels,), image units
-    reflectance : float32 array (pixels,)
-        Of the model, without phase factor and falloff.
-    phase : float32 array (pixels,), rad
-    off_axis : float32 array (pixels,), rad squared
-        Square of the angle between view ray and nadir at the camera.
-    weight : float32 array (pixels,)
-        Mask times feathering; 0 where the pixel is not used.
-    precision : float32 array (pixels,), 1 / image units squared
-        Inverse of the expected variance, up to one factor for all.
-    """
-
-    windows: np.ndarray
-    starts: np.ndarray
-    measured: np.ndarray
-    reflectance: np.ndarray
-    phase: np.ndarray
-    off_axis: np.ndarray
-    weight: np.ndarray
-    precision: np.ndarray
-
-
-class Pairs(NamedTuple):
-    """Which images overlap: for image i its partners j >= i, itself included.
-
-    Attributes
-    ----------
-    first : int64 array (images + 1,)
-        Partners of i are ``second[first[i]:first[i + 1]]``.
-    second : int64 array (pairs,)
-    """
-
-    first: np.ndarray
-    second: np.ndarray
-
-
-class Sums(NamedTuple):
-    """What one pass leaves; the first axis counts blocks of rows.
-
-    Attributes
-    ----------
-    own : array (blocks, images, 2, 2)
-        w J^T J of each image's parameters, upper triangle, before elimination.
-    pairs : array (blocks, pairs, 2, 2)
-        What the elimination of the albedo subtracts.
-    shared_pixels : array (blocks, pairs)
-        Pixels that both images of a pair see.
-    border : array (blocks, images, 2, 4)
-        Image parameters against shared ones, eliminated.
-    square : array (blocks, 4, 4)
-        Shared parameters, upper triangle, eliminated.
-    gradient : array (blocks, images, 2)
-    shared_gradient : array (blocks, 4)
-    means : array (blocks, images, 7)
-        Sums of weight, weight I, weight M and of weight times the derivatives of M.
-    patches : array (blocks, images, 8, 8)
-        Sum of the scores (derivative of the loss) in each patch of each image.
-    score_square : array (blocks,)
-    histogram : array (blocks, SCALE_BINS)
-        Sizes of residuals times the root of their precision.
-    cost : array (blocks,)
-    """
-
-    own: np.ndarray
-    pairs: np.ndarray
-    shared_pixels: np.ndarray
-    border: np.ndarray
-    square: np.ndarray
-    gradient: np.ndarray
-    shared_gradient: np.ndarray
-    means: np.ndarray
-    patches: np.ndarray
-    score_square: np.ndarray
-    histogram: np.ndarray
-    cost: np.ndarray
-
-
-class State(NamedTuple):
-    """Where the iteration stands.
-
-    Attributes
-    ----------
-    exposure : float64 array (images,)
-    haze : float64 array (images,), image units
-    level : float64 array (images,), image units
-        Unit in which haze is counted, so that it is of order 1.
-    shared : float64 array (4,)
-        c1 (per rad), c2, v2 (per rad^2), v4 (per rad^4).
-    """
-
-    exposure: np.ndarray
-    haze: np.ndarray
-    level: np.ndarray
-    shared: np.ndarray
-
-
-class Maps(NamedTuple):
-    """Arrays on the grid, overwritten by each pass.
-
-    Attributes
-    ----------
-    albedo : float64 array (rows, cols)
-    information : float64 array (rows, cols)
-        Sum of w M^2, the inverse variance of the albedo up to a factor.
-    spread : float64 array (rows, cols)
-        Sum of w^2 M^2 over the precision; over ``information`` squared, the variance of the albedo
-        when residuals have unit variance (weights that fall to the border are not variances).
-    scatter : float64 array (rows, cols)
-        Sum of w times the squared residual.
-    freedom : float64 array (rows, cols)
-        Sum of weights times (n - 1) / n: the part of ``scatter`` that the fit leaves free.
-    count : int32 array (rows, cols)
-        Images that see the post.
-    """
-
-    albedo: np.ndarray
-    information: np.ndarray
-    spread: np.ndarray
-    scatter: np.ndarray
-    freedom: np.ndarray
-    count: np.ndarray
-
-
-class Work(NamedTuple):
-    """Buffers of one row: per image (first axis) and per column (last axis)."""
-
-    brightness: np.ndarray
-    derivatives: np.ndarray
-    w: np.ndarray
-    u: np.ndarray
-    u_shared: np.ndarray
-    top: np.ndarray
-    inverse: np.ndarray
-    residual: np.ndarray
-
-
-def empty_sums(images, pairs):
-    """Sums of nothing."""
-    return Sums(
-        own=np.zeros((BLOCKS, images, OWN, OWN)),
-        pairs=np.zeros((BLOCKS, pairs, OWN, OWN)),
-        shared_pixels=np.zeros((BLOCKS, pairs)),
-        border=np.zeros((BLOCKS, images, OWN, SHARED)),
-        square=np.zeros((BLOCKS, SHARED, SHARED)),
-        gradient=np.zeros((BLOCKS, images, OWN)),
-        shared_gradient=np.zeros((BLOCKS, SHARED)),
-        means=np.zeros((BLOCKS, images, 3 + SHARED)),
-        patches=np.zeros((BLOCKS, images, PATCHES, PATCHES)),
-        score_square=np.zeros(BLOCKS),
-        histogram=np.zeros((BLOCKS, SCALE_BINS)),
-        cost=np.zeros(BLOCKS),
-    )
-
-
-@njit(cache=True, error_model="numpy")
-def robust_weight(x, loss):
-    """Derivative of the loss by x, divided by x; x is a residual in standard errors."""
-    if loss == HUBER:
-        return min(1.0, HUBER_TUNING / max(abs(x), 1e-30))
-    if loss == CAUCHY:
-        return 1.0 / (1.0 + (x / CAUCHY_TUNING) ** 2)
-    return 1.0
-
-
-@njit(cache=True, error_model="numpy")
-def robust_loss(x, loss):
-    """Loss of a residual x in standard errors; x^2/2 near zero."""
-    if loss == HUBER:
-        size = abs(x)
-        if size > HUBER_TUNING:
-            return HUBER_TUNING * (size - 0.5 * HUBER_TUNING)
-    elif loss == CAUCHY:
-        return 0.5 * CAUCHY_TUNING**2 * np.log1p((x / CAUCHY_TUNING) ** 2)
-    return 0.5 * x * x
-
-
-@njit(cache=True, error_model="numpy")
-def brightness_row(reflectance, phase, off_axis, exposure, shared, brightness, derivatives):
-    """Brightness of albedo 1 along a row, and its derivatives by c1, c2, v2 and v4.
-
-    Parameters
-    ----------
-    reflectance, phase, off_axis : float32 array (cols,)
-    exposure : float
-    shared : float64 array (4,)
-        c1 (per rad), c2, v2 (per rad^2), v4 (per rad^4).
-    brightness : float64 array (cols,)
-    derivatives : float64 array (4, cols)
-        Overwritten, as is ``brightness``.
-    """
-    c1, c2, v2, v4 = shared[0], shared[1], shared[2], shared[3]
-    for j in range(reflectance.size):
-        square = off_axis[j]
-        decay = np.exp(-c1 * phase[j])
-        level = exposure * reflectance[j] * np.exp(-square * (v2 + v4 * square))
-        brightness[j] = level * (decay + c2)
-        derivatives[0, j] = -phase[j] * decay * level
-        derivatives[1, j] = level
-        derivatives[2, j] = -square * brightness[j]
-        derivatives[3, j] = -square * square * brightness[j]
-
-
-@njit(cache=True, error_model="numpy")
-def weigh_row(
-    measured, weight, precision, brightness, haze, albedo, scale, loss, w, top, bottom, spread
-):
-    """Robust weights of a row from the last albedo; adds to the sums per post."""
-    for j in range(measured.size):
-        value = measured[j] - haze
-        x = (albedo[j] * brightness[j] - value) * np.sqrt(precision[j]) / scale
-        share = weight[j] * robust_weight(x, loss)
-        w[j] = share * precision[j]
-        top[j] += w[j] * brightness[j] * value
-        bottom[j] += w[j] * brightness[j] * brightness[j]
-        spread[j] += share * w[j] * brightness[j] * brightness[j]
-
-
-@njit(cache=True, error_model="numpy")
-def image_sums(brightness, derivatives, w, albedo, residual, level, own, border, gradient, u):
-    """Sums of one image along a row before elimination; ``u`` receives w M J per pixel."""
-    for j in range(brightness.size):
-        jt = albedo[j] * brightness[j]
-        wt, wb = w[j] * jt, w[j] * level
-        own[0, 0] += wt * jt
-        own[0, 1] += wt * level
-        own[1, 1] += wb * level
-        gradient[0] += wt * residual[j]
-        gradient[1] += wb * residual[j]
-        u[0, j] = wt * brightness[j]
-        u[1, j] = wb * brightness[j]
-        for g in range(SHARED):
-            border[0, g] += wt * albedo[j] * derivatives[g, j]
-            border[1, g] += wb * albedo[j] * derivatives[g, j]
-
-
-@njit(cache=True, error_model="numpy")
-def shared_sums(brightness, derivatives, w, albedo, residual, square, gradient, u):
-    """Sums of the shared parameters along a row; adds w M J of this image to ``u``."""
-    for g in range(SHARED):
-        for j in range(brightness.size):
-            wg = w[j] * albedo[j] * derivatives[g, j]
-            gradient[g] += wg * residual[j]
-            u[g, j] += wg * brightness[j]
-        for h in range(g, SHARED):
-            for j in range(brightness.size):
-                square[g, h] += w[j] * albedo[j] ** 2 * derivatives[g, j] * derivatives[h, j]
-
-
-@njit(cache=True, error_model="numpy")
-def dot3(a, b, c):
-    """Sum of a b c over a row."""
-    total = 0.0
-    for j in range(a.size):
-        total += a[j] * b[j] * c[j]
-    return total
-
-
-@njit(cache=True, error_model="numpy")
-def residual_sums(residual, weight, precision, w, count, scale, loss, scatter, histogram, patches):
-    """Cost and squared scores of a row; adds to the scatter per pixel and to the sums per patch.
-
-    The histogram counts pixels seen at least twice, residuals enlarged by sqrt(n / (n - 1))
-    because the albedo was fitted to n values.
-    """
-    cost, score_square = 0.0, 0.0
-    cols = residual.size
-    for j in range(cols):
-        if weight[j] <= 0.0:
-            continue
-        size = residual[j] * np.sqrt(precision[j])
-        x = size / scale
-        cost += weight[j] * robust_loss(x, loss)
-        score = weight[j] * robust_weight(x, loss) * x
-        score_square += score * score
-        patches[j * PATCHES // cols] += score
-        scatter[j] += w[j] * residual[j] * residual[j]
-        if count[j] > 1:
-            enlarged = abs(size) * np.sqrt(count[j] / (count[j] - 1.0))
-            place = np.int64((np.log2(max(enlarged, 1e-30)) - SCALE_LOW) / SCALE_STEP)
-            histogram[min(max(place, 0), SCALE_BINS - 1)] += 1.0
-    return cost, score_square
+from lommel.estimate.albedo_arrays import BLOCKS, OWN, PATCHES, SHARED, Sums, Work
+from lommel.estimate.albedo_rows import (
+    brightness_row,
+    count_row,
+    dot3,
+    image_sums,
+    mean_sums,
+    residual_sums,
+    shared_sums,
+    weigh_row,
+)
 
 
 @njit(cache=True, error_model="numpy")
@@ -356,19 +66,12 @@ def _first_sweep(
             bottom[cols],
             spread[cols],
         )
-        _count(weight, count[cols], freedom[cols])
+        count_row(weight, count[cols], freedom[cols])
     for j in range(albedo.size):
         work.inverse[j] = 1.0 / bottom[j] if bottom[j] > 0.0 else 0.0
         albedo[j] = top[j] * work.inverse[j]
         if count[j] > 0:
             freedom[j] *= (count[j] - 1) / count[j]
-
-
-@njit(cache=True, error_model="numpy")
-def _count(weight, count, freedom):
-    for j in range(weight.size):
-        count[j] += weight[j] > 0.0
-        freedom[j] += weight[j]
 
 
 @njit(cache=True, error_model="numpy")
@@ -407,7 +110,7 @@ def _second_sweep(row, samples, images, state, scale, loss, work, sums, albedo, 
             sums.shared_gradient,
             work.u_shared[:, cols],
         )
-        _mean_sums(measured, weight, brightness, derivatives, sums.means[k])
+        mean_sums(measured, weight, brightness, derivatives, sums.means[k])
         patch = (row - samples.windows[k, 0]) * PATCHES // samples.windows[k, 2]
         cost, score_square = residual_sums(
             residual,
@@ -423,16 +126,6 @@ def _second_sweep(row, samples, images, state, scale, loss, work, sums, albedo, 
         )
         sums.cost[0] += cost
         sums.score_square[0] += score_square
-
-
-@njit(cache=True, error_model="numpy")
-def _mean_sums(measured, weight, brightness, derivatives, means):
-    for j in range(measured.size):
-        means[0] += weight[j]
-        means[1] += weight[j] * measured[j]
-        means[2] += weight[j] * brightness[j]
-        for g in range(SHARED):
-            means[3 + g] += weight[j] * derivatives[g, j]
 
 
 @njit(cache=True, error_model="numpy")
@@ -575,7 +268,7 @@ def accumulate(samples, pairs, state, scale, loss, maps, sums):
             place_of = np.empty(samples.starts.size, np.int64)
             for row in range(first_row, last_row):
                 images = _images_in(row, samples, place_of)
-                albedo, scatter, count = maps.albedo[row], maps.scatter[row], maps.count[row]
+                albedo, scatter, count = maps.albedo[row], maps.scatter[row], maps.image_count[row]
                 _first_sweep(
                     row,
                     samples,

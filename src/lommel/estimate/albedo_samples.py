@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lommel.estimate.albedo_kernels import Pairs, Samples
+from lommel.estimate.albedo_arrays import Pairs, Samples
 from lommel.scene.geometry import surface_normals, unit, viewing_geometry
 from lommel.scene.grid import Window
 from lommel.scene.masks import pixel_weights, shadow_thresholds
@@ -221,3 +221,27 @@ def overlapping_pairs(windows):
         second.append(i + np.flatnonzero(overlaps))
         first.append(first[-1] + len(second[-1]))
     return Pairs(np.array(first, np.int64), np.concatenate([np.zeros(0, int), *second]))
+
+
+def orthomosaic(samples, shape):
+    """Weighted mean of the images as they are, for comparison with the albedo.
+
+    Parameters
+    ----------
+    samples : Samples
+    shape : tuple of int
+
+    Returns
+    -------
+    mosaic : float32 array (rows, cols), image units; NaN where no image is
+    """
+    total, weights = np.zeros(shape), np.zeros(shape)
+    for (row, col, rows, cols), start in zip(samples.windows, samples.starts, strict=True):
+        here = slice(row, row + rows), slice(col, col + cols)
+        part = slice(start, start + rows * cols)
+        weight = samples.weight[part].reshape(rows, cols)
+        total[here] += weight * samples.measured[part].reshape(rows, cols)
+        weights[here] += weight
+    mosaic = np.full(shape, np.nan, np.float32)
+    np.divide(total, weights, out=mosaic, where=weights > 0, casting="same_kind")
+    return mosaic

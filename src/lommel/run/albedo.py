@@ -8,12 +8,13 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
-from lommel.estimate.albedo import AlbedoSettings, estimate_albedo, published_settings
+from lommel.estimate.albedo import estimate_albedo
 from lommel.estimate.albedo_quality import (
     brightness_ramp,
     shading_in_albedo,
     slope_towards_sun,
 )
+from lommel.estimate.albedo_settings import AlbedoSettings, published_settings
 from lommel.io.raster import write_raster
 from lommel.run.inputs import GridSettings, SceneFiles, Skipped, read_scene
 from lommel.run.products import RunRecord, output_folder
