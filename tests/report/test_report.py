@@ -68,8 +68,8 @@ def test_page_says_results_outcome_settings_stages_and_digests(demo_report):
 
 def test_targets_stand_beside_the_results(demo_report):
     text = Page(demo_report).text
-    assert "exposure rms 0.5 % at most 1 error of" in text
-    assert "albedo rms 4.1 % at most 3 missed error of" in text
+    assert "removed 0.5 % at most 1 " in text
+    assert "removed 4.1 % at most 3 missed " in text
 
 
 def test_page_loads_nothing_from_elsewhere(demo_report):
