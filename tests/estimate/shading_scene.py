@@ -4,7 +4,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from lommel.core.reflectance import reflectance_model
-from lommel.estimate.shape_from_shading import fresh_problem
+from lommel.estimate.problem import fresh_problem
 from lommel.estimate.surface import Surface
 from lommel.scene.body import MOON, local_frame, to_xyz
 from lommel.scene.geometry import Observation

@@ -7,8 +7,9 @@ from scipy.ndimage import gaussian_filter, zoom
 from lommel.core.multigrid import NormalEquations, conjugate_gradients
 from lommel.core.normal_operator import slope_adjoint
 from lommel.core.reflectance import reflectance_model
+from lommel.estimate.holes import fill_holes
 from lommel.estimate.priors import Priors
-from lommel.estimate.shape_from_shading import SolverSettings, fill_holes, solve_surface
+from lommel.estimate.shape_from_shading import SolverSettings, solve_surface
 from lommel.estimate.surface import Surface
 from lommel.scene.geometry import Observation, surface_normals, viewing_geometry
 from lommel.scene.grid import Grid
@@ -40,7 +41,7 @@ def test_gauss_newton_converges_quadratically_on_an_exact_scene():
     u = truth + hills(grid.shape, seed=4, rms=3.0)
     errors = []
     for _ in range(4):
-        tensors, gradient, _ = problem.assemble(u)
+        tensors, gradient, *_ = problem.assemble(u)
         right = np.empty_like(u)
         slope_adjoint(gradient[0], gradient[1], right)
         right += np.float32(1e-4) * (u - truth)

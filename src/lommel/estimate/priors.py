@@ -47,6 +47,9 @@ class Priors:
     smoothing : float, posts
         The initial DEM is the better guess of the terrain only where it is smooth over so many
         posts (standard deviation of a Gaussian).
+    albedo_error : float, dimensionless
+        Standard error of each cell's albedo about 1, which is eliminated cell by cell; 0 where too
+        few kinds of light tell albedo from slope.
     """
 
     noise: np.ndarray
@@ -54,6 +57,7 @@ class Priors:
     albedo_contrast: float
     dem_errors: np.ndarray
     smoothing: float
+    albedo_error: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -190,8 +190,13 @@ WORK_ROWS = 24
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "nsz", "reassoc"})
-def _accumulate_row(reflectance, by_p, by_q, albedo, measured, image, gpp, gpq, gqq, gp, gq, sums):
+def _accumulate_row(
+    reflectance, by_p, by_q, albedo, measured, image, tensors, gradient, shared, r, sums
+):
     """Add one row of one image to tensors, gradients and sums."""
+    gpp, gpq, gqq = tensors[0, r], tensors[1, r], tensors[2, r]
+    gp, gq = gradient[0, r], gradient[1, r]
+    ap, aq, aa, ga = shared[0, r], shared[1, r], shared[2, r], shared[3, r]
     exposure, haze, weight, softness = image[0], image[1], image[2], image[3]
     zero, one, two = np.float32(0.0), np.float32(1.0), np.float32(2.0)
     cost = total = sf = sff = sfm = sm = srr = 0.0
@@ -212,6 +217,11 @@ def _accumulate_row(reflectance, by_p, by_q, albedo, measured, image, gpp, gpq, 
         gqq[c] += w * rq * rq
         gp[c] += w * residual * rp
         gq[c] += w * residual * rq
+        by_albedo = exposure * reflectance[c]
+        ap[c] += w * by_albedo * rp
+        aq[c] += w * by_albedo * rq
+        aa[c] += w * by_albedo * by_albedo
+        ga[c] += w * by_albedo * residual
         total += w
         sf += w * f
         sff += w * f * f
@@ -231,7 +241,19 @@ def _accumulate_row(reflectance, by_p, by_q, albedo, measured, image, gpp, gpq, 
 
 @njit(cache=True, parallel=True)
 def assemble(
-    u, gram, light, step, spacing, kind, parameters, albedo, measured, image, tensors, gradient
+    u,
+    gram,
+    light,
+    step,
+    spacing,
+    kind,
+    parameters,
+    albedo,
+    measured,
+    image,
+    tensors,
+    gradient,
+    shared,
 ):
     """Add one image to the normal equations.
 
@@ -256,6 +278,9 @@ def assemble(
         Gpp, Gpq, Gqq per squared difference of heights; added to.
     gradient : float32 array (2, rows - 1, cols - 1)
         Of half the cost with respect to the differences; added to.
+    shared : float32 array (4, rows - 1, cols - 1)
+        What the cell's albedo shares with the differences: the two mixed second derivatives, its
+        own second derivative, and its gradient; added to.
 
     Returns
     -------
@@ -281,14 +306,60 @@ def assemble(
                 albedo[r],
                 measured[r],
                 image,
-                tensors[0, r],
-                tensors[1, r],
-                tensors[2, r],
-                gradient[0, r],
-                gradient[1, r],
+                tensors,
+                gradient,
+                shared,
+                r,
                 sums[np.int64(block)],
             )
     return sums.sum(axis=0)
+
+
+@njit(cache=True, parallel=True, fastmath=FAST)
+def eliminate_albedo(albedo, tensors, gradient, shared, precision, best):
+    r"""Take each cell's own albedo out of the normal equations.
+
+    Albedo is expected to be 1 with a standard error whose inverse square is ``precision``. Its
+    best value for given slopes is closed-form, and what is left is
+
+    .. math:: G - c c^T / h, \quad g - c\, g_A / h, \quad Q - g_A^2 / 2 h,
+              \quad h = h_{AA} + \mathrm{precision}
+
+    Parameters
+    ----------
+    albedo : float32 array (rows - 1, cols - 1)
+        As assumed by `assemble`.
+    tensors, gradient, shared
+        As `assemble` leaves them; the first two are changed.
+    precision : float
+    best : float32 array (rows - 1, cols - 1)
+        Gets the albedo that fits best.
+
+    Returns
+    -------
+    cost : float
+        What expectation and elimination add to twice the cost; negative or zero on balance
+        when the assumed albedo was the best already.
+    """
+    rows, cols = albedo.shape
+    costs = np.zeros(rows)
+    for i in prange(rows):
+        r = np.int64(i)
+        ap, aq, aa, ga = shared[0, r], shared[1, r], shared[2, r], shared[3, r]
+        cost = 0.0
+        for c in range(cols):
+            off = albedo[r, c] - np.float32(1.0)
+            inverse = np.float32(1.0) / (aa[c] + precision)
+            slope = ga[c] + precision * off
+            tensors[0, r, c] -= ap[c] * ap[c] * inverse
+            tensors[1, r, c] -= ap[c] * aq[c] * inverse
+            tensors[2, r, c] -= aq[c] * aq[c] * inverse
+            gradient[0, r, c] -= ap[c] * slope * inverse
+            gradient[1, r, c] -= aq[c] * slope * inverse
+            best[r, c] = albedo[r, c] - slope * inverse
+            cost += precision * off * off - slope * slope * inverse
+        costs[r] = cost
+    return costs.sum()
 
 
 @njit(cache=True, parallel=True)

@@ -15,44 +15,20 @@ leaves one 2x2 tensor per cell (`lommel.estimate.shading_kernels`); the linear s
 (`lommel.core.multigrid`) never sees an image. Most callers want `solve_surface`.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from lommel.core.least_squares import Solution
-from lommel.core.multigrid import (
-    NormalEquations,
-    add_long_waves,
-    coarse_masses,
-    conjugate_gradients,
-    dot,
-    threads_for,
-)
-from lommel.core.normal_operator import (
-    apply_operator,
-    coarse_shape,
-    prolong_add,
-    restrict,
-    slope_adjoint,
-)
+from lommel.core.multigrid import NormalEquations, conjugate_gradients, dot
+from lommel.core.normal_operator import prolong_add
 from lommel.estimate.albedo_field import fit_albedo
 from lommel.estimate.priors import Priors, estimate_priors
-from lommel.estimate.shading_kernels import (
-    SUM_COST,
-    SUM_FF,
-    SUM_FM,
-    assemble,
-    predict,
-    sample_cells,
-)
+from lommel.estimate.problem import best_exposures, fresh_problem
 
 COARSEST = 24  # posts along the shorter side of the coarsest level that sees the images
 COARSE_STEPS = 2  # Gauss-Newton steps per coarse level
-SLOPE_STEP = 0.01  # for the change of brightness with slope: R bends little over half a degree
-HOLD = 100.0  # how much stiffer known heights are held than the plate that closes holes
-FILL_REDUCTION, FILL_CYCLES = 1e-3, 60
-HUBER_SCALE = 3.0  # noise standard errors from which a residual counts as an outlier
+SHORTEST_STEP = 0.1  # of a Gauss-Newton step, before a rising cost is accepted as rounding
 
 
 @dataclass(frozen=True)
@@ -83,136 +59,6 @@ class SolverSettings:
     estimate_albedo: bool = True
 
 
-@dataclass
-class Problem:
-    """One level of the coarse-to-fine hierarchy."""
-
-    surface: object
-    model: object
-    views: list
-    exposures: np.ndarray
-    hazes: np.ndarray
-    weights: np.ndarray
-    stride: int
-    initial: np.ndarray
-    cells: list
-    albedo: np.ndarray
-    curvature: np.ndarray
-    masses: np.ndarray
-    slope: np.ndarray
-    expected: np.ndarray
-    geometry: list = field(default_factory=list)
-
-    def prepare_geometry(self, u):
-        """Compute the lattice planes for the surface ``u``."""
-        distance = min(
-            np.linalg.norm(view.position) - self.surface.grid.body.radius for view in self.views
-        )
-        lattice = self.surface.lattice(u.shape, self.stride, distance)
-        at_nodes = lattice_heights(u, lattice)
-        frame = self.surface.frame(lattice, at_nodes)
-        gram = frame.gram.astype(np.float32)
-        lights = [light_planes(frame, view, self.model) for view in self.views]
-        self.geometry = [lattice, at_nodes, frame, gram, lights]
-
-    def assemble(self, u):
-        """Tensors, gradient and cost at ``u``, data only."""
-        lattice, _, _, gram, lights = self.geometry
-        rows, cols = u.shape
-        tensors = np.zeros((3, rows - 1, cols - 1), np.float32)
-        tensors[0], tensors[2] = self.slope
-        gradient = np.zeros((2, rows - 1, cols - 1), np.float32)
-        spacing = np.array(self.surface.grid.spacing, np.float32) * self.stride
-        parameters = self.model.parameter_array()
-        sums = np.zeros((len(self.views), 8))
-        for k, light in enumerate(lights):
-            scale = self.weights[k]
-            image = np.array(
-                [self.exposures[k], self.hazes[k], scale * self.stride**2, scale / HUBER_SCALE**2],
-                np.float32,
-            )
-            with threads_for(u.shape):
-                sums[k] = assemble(
-                    u,
-                    gram,
-                    light,
-                    lattice.step,
-                    spacing,
-                    self.model.kind,
-                    parameters,
-                    self.albedo,
-                    self.cells[k],
-                    image,
-                    tensors,
-                    gradient,
-                )
-        return tensors, gradient, sums
-
-    def predict(self, u, k):
-        """Modelled image ``k`` on the cells."""
-        lattice, _, _, gram, lights = self.geometry
-        out = np.empty((u.shape[0] - 1, u.shape[1] - 1), np.float32)
-        spacing = np.array(self.surface.grid.spacing, np.float32) * self.stride
-        image = np.array([self.exposures[k], self.hazes[k]], np.float32)
-        with threads_for(u.shape):
-            predict(
-                u,
-                gram,
-                lights[k],
-                lattice.step,
-                spacing,
-                self.model.kind,
-                self.model.parameter_array(),
-                self.albedo,
-                image,
-                out,
-            )
-        return out
-
-    def mean_gain(self, u, k):
-        """Mean change of image ``k`` with the slopes along columns and rows, image units."""
-        flat = np.zeros_like(u)
-        tilt = np.float32(SLOPE_STEP)
-        centre = self.predict(flat, k)
-        gains = []
-        for axis, spacing in ((1, self.surface.grid.spacing[1]), (0, self.surface.grid.spacing[0])):
-            shape = [1, 1]
-            shape[axis] = u.shape[axis]
-            ramp = tilt * np.float32(spacing) * np.arange(u.shape[axis], dtype=np.float32)
-            change = self.predict(np.ascontiguousarray(flat + ramp.reshape(shape)), k) - centre
-            gains.append(float(change.mean() / tilt))
-        return gains
-
-    def expect(self, priors):
-        """Take over priors: weights of every term, and the surface expected before the images."""
-        s_row, s_col = self.surface.grid.spacing
-        mean = (s_row * s_col) ** 0.5
-        self.weights = np.asarray(priors.noise, float) ** -2.0
-        curvature = np.array([1 / s_col**2, 2 / mean**2, 1 / s_row**2]) / priors.roughness**2
-        brightness = np.array([np.nanmean(cells) for cells in self.cells])
-        blur = (priors.albedo_contrast * np.median(brightness / priors.noise)) ** 2
-        self.curvature = curvature.astype(np.float32)
-        self.slope = (blur * curvature[[0, 2]]).astype(np.float32)
-        self.masses = np.asarray(priors.dem_errors, float) ** -2.0
-        self.expected = gaussian_filter(self.initial, priors.smoothing, mode="nearest")
-
-    def prior_gradient(self, u):
-        """Gradient of the prior terms at ``u``, and their cost."""
-        rows, cols = u.shape
-        change = u - self.expected
-        along, across = (np.full((rows - 1, cols - 1), weight) for weight in self.slope)
-        none = np.zeros_like(along)
-        massless = np.zeros((1, cols), np.float32)
-        out = np.empty_like(u)
-        with threads_for(u.shape):
-            apply_operator(
-                change, along, none, across, self.curvature, np.float32(0), massless, out
-            )
-        cost = dot(change, out) / 2
-        cost += add_long_waves(change, self.masses, out) / 2
-        return out, cost
-
-
 @dataclass(frozen=True)
 class SurfaceSolution:
     """The refined surface.
@@ -241,65 +87,6 @@ class SurfaceSolution:
     priors: Priors
 
 
-def light_planes(frame, view, model):
-    """Light and view along the normal's vectors, phase share and factor, at the nodes.
-
-    Parameters
-    ----------
-    frame : Frame
-    view : OrthoView or CameraView
-    model : ReflectanceModel
-
-    Returns
-    -------
-    planes : float32 array (8, node_rows, node_cols)
-    """
-    to_sun = view.sun_position - frame.xyz
-    to_sun /= np.linalg.norm(to_sun, axis=-1, keepdims=True)
-    to_camera = view.position - frame.xyz
-    to_camera /= np.linalg.norm(to_camera, axis=-1, keepdims=True)
-    phase = np.arccos(np.clip(np.einsum("...i,...i", to_sun, to_camera), -1, 1))
-    share, factor = model.phase_terms(phase)
-    planes = [np.einsum("...i,...i", frame.c[k], to_sun) for k in range(3)]
-    planes += [np.einsum("...i,...i", frame.c[k], to_camera) for k in range(3)]
-    return np.stack([*planes, share, factor]).astype(np.float32)
-
-
-def lattice_heights(u, lattice):
-    """Values of a post array at the nodes of a lattice, averaged over a cell of the lattice."""
-    half = max(lattice.step // 2, 0)
-    row = np.minimum((lattice.row[:, 0] / lattice.stride).astype(int), u.shape[0] - 1)
-    col = np.minimum((lattice.col[0] / lattice.stride).astype(int), u.shape[1] - 1)
-    total = np.zeros((row.size, col.size))
-    offsets = sorted({-half, 0, half})
-    for dr in offsets:
-        for dc in offsets:
-            rows = np.clip(row + dr, 0, u.shape[0] - 1)
-            cols = np.clip(col + dc, 0, u.shape[1] - 1)
-            total += u[rows[:, None], cols[None, :]]
-    return total / len(offsets) ** 2
-
-
-def coarse_cells(cells):
-    """Mean of 2x2 cells; NaN where one is missing or beyond the border."""
-    rows, cols = cells.shape
-    out = np.full(((rows + 1) // 2, (cols + 1) // 2), np.nan, np.float32)
-    even = cells[: rows // 2 * 2, : cols // 2 * 2]
-    out[: rows // 2, : cols // 2] = 0.25 * (
-        even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]
-    )
-    return out
-
-
-def coarse_posts(posts):
-    """Weighted mean around every second post."""
-    total = np.zeros(coarse_shape(posts.shape), np.float32)
-    weight = np.zeros_like(total)
-    restrict(np.ascontiguousarray(posts), total)
-    restrict(np.ones_like(posts), weight)
-    return total / weight
-
-
 def solve_surface(surface, initial, views, model, priors=None, settings=None, albedo=None):
     """Refine a surface by the shading in images.
 
@@ -324,146 +111,83 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
     settings = settings or SolverSettings()
     finest = fresh_problem(surface, initial, views, model, albedo)
     finest.prepare_geometry(finest.initial)
-    _sample_images(finest, finest.initial)
-    _fit_exposures(finest)
-    if priors is None:
-        priors = _estimate_priors(finest)
+    finest.sample_images(finest.initial)
+    finest.exposures[:] = best_exposures(finest.assemble(finest.initial)[2], finest.exposures)
+    priors = priors or _estimate_priors(finest)
     finest.expect(priors)
     started = [finest.predict(finest.initial, k) for k in range(len(views))]
-    levels = [finest]
-    while min(levels[-1].initial.shape) >= 2 * COARSEST:
-        levels.append(_coarser(levels[-1]))
-    history, correction, exposures = [], None, finest.exposures.copy()
-    for level in reversed(levels):
-        u = level.initial.copy()
-        level.exposures[:] = exposures
-        if correction is not None:
-            prolong_add(correction, u)
-        if level is finest:
-            level.prepare_geometry(u)
-            _sample_images(level, u)
-        steps = settings.max_steps if level is finest else COARSE_STEPS
-        u, converged = _descend(level, u, steps, settings, history)
-        correction, exposures = u - level.initial, level.exposures.copy()
-    outcome, advice = _outcome(converged, history)
+    history: list[dict] = []
+    u, converged = _coarse_to_fine(finest, settings, history)
     if settings.estimate_albedo:
         _fit_albedo(finest, u, priors)
     modelled = [finest.predict(u, k) for k in range(len(views))]
     value = SurfaceSolution(
         u, finest.albedo, finest.exposures, finest.hazes, finest.cells, modelled, started, priors
     )
-    return Solution(value, outcome, advice, history)
+    return Solution(value, *_outcome(converged, history), history)
+
+
+def _coarse_to_fine(finest, settings, history):
+    """Solve on ever finer grids, each starting from the correction found on the last."""
+    levels = [finest]
+    while min(levels[-1].initial.shape) >= 2 * COARSEST:
+        levels.append(levels[-1].coarser())
+    u, converged = levels[-1].initial, False
+    for depth in range(len(levels) - 1, -1, -1):
+        level = levels[depth]
+        if depth < len(levels) - 1:
+            coarse = levels.pop()
+            correction, u = u - coarse.initial, level.initial.copy()
+            prolong_add(correction, u)
+            level.exposures[:] = coarse.exposures
+        if level is finest:
+            level.prepare_geometry(u)
+            level.sample_images(u)
+        steps = settings.max_steps if level is finest else COARSE_STEPS
+        u, converged = _descend(level, u, steps, settings, history)
+    return u, converged
 
 
 def _descend(level, u, steps, settings, history):
-    """Gauss-Newton steps on one level."""
-    is_finest = level.stride == 1
-    converged = False
-    tensors, gradient, sums = level.assemble(u)
-    prior, prior_cost = level.prior_gradient(u)
-    cost = sums[:, SUM_COST].sum() / 2 + prior_cost
+    """Gauss-Newton steps on one level, shortened where the cost would rise."""
+    here = level.expand(u)
     for _ in range(steps):
-        right = np.empty_like(u)
-        with threads_for(u.shape):
-            slope_adjoint(gradient[0], gradient[1], right)
-        right = -(right + prior)
-        equations = NormalEquations(tuple(tensors), level.curvature, level.masses)
+        equations = NormalEquations(tuple(here.tensors), level.curvature, level.masses)
         linear = conjugate_gradients(
-            equations, right, settings.cycle_tolerance, settings.max_cycles
+            equations, -here.gradient, settings.cycle_tolerance, settings.max_cycles
         )
-        length, last = 1.0, cost
-        while True:
-            trial = u + np.float32(length) * linear.x
-            if is_finest:
-                _sample_images(level, trial)
-            tensors, gradient, sums = level.assemble(trial)
-            prior, prior_cost = level.prior_gradient(trial)
-            cost = sums[:, SUM_COST].sum() / 2 + prior_cost
-            if cost <= last or length < 0.1:
-                break
+        length, last = 1.0, here.cost
+        u, start = u + linear.x, u
+        here = _look(level, u)
+        while here.cost > last and length > SHORTEST_STEP:
             length /= 2
-        u = trial
+            u = start + np.float32(length) * linear.x
+            here = _look(level, u)
         step = float(length * np.sqrt(dot(linear.x, linear.x) / linear.x.size))
         history.append(
             {
                 "stride": level.stride,
-                "cost": float(cost),
+                "cost": here.cost,
                 "step_m": step,
                 "cycles": linear.iterations,
                 "reduction": linear.reduction,
                 "length": length,
             }
         )
+        level.albedo = here.albedo
         if settings.estimate_exposure:
-            level.exposures[:] = _best_exposures(sums, level.exposures)
-            tensors, gradient, sums = level.assemble(u)
-            cost = sums[:, SUM_COST].sum() / 2 + prior_cost
+            level.exposures[:] = best_exposures(level.assemble(u)[2], level.exposures)
+            here = level.expand(u)
         if step < settings.step_tolerance:
-            converged = True
-            break
-    return u, converged
+            return u, True
+    return u, False
 
 
-def _best_exposures(sums, exposures):
-    has_data = sums[:, SUM_FF] > 0
-    return np.where(has_data, sums[:, SUM_FM] / np.where(has_data, sums[:, SUM_FF], 1), exposures)
-
-
-def fresh_problem(surface, initial, views, model, albedo):
-    """The finest level before images are sampled and priors known; see `solve_surface`."""
-    rows, cols = initial.shape
-    count = len(views)
-    if albedo is None:
-        albedo = np.ones((rows - 1, cols - 1), np.float32)
-    return Problem(
-        surface,
-        model,
-        views,
-        np.ones(count),
-        np.zeros(count),
-        np.ones(count),
-        1,
-        np.ascontiguousarray(initial, np.float32),
-        [np.empty((rows - 1, cols - 1), np.float32) for _ in views],
-        albedo,
-        curvature=np.zeros(3, np.float32),
-        masses=np.zeros(1),
-        slope=np.zeros(2, np.float32),
-        expected=initial,
-    )
-
-
-def _coarser(finer):
-    coarse = replace(
-        finer,
-        exposures=finer.exposures.copy(),
-        stride=2 * finer.stride,
-        initial=coarse_posts(finer.initial),
-        expected=coarse_posts(finer.expected),
-        cells=[coarse_cells(cells) for cells in finer.cells],
-        albedo=np.nan_to_num(coarse_cells(finer.albedo), nan=1.0),
-        curvature=finer.curvature / 4,
-        masses=coarse_masses(finer.masses, 1),
-    )
-    coarse.prepare_geometry(coarse.initial)
-    return coarse
-
-
-def _sample_images(level, u):
-    lattice, at_nodes, frame, _, _ = level.geometry
-    reference = level.initial
-    for view, cells in zip(level.views, level.cells, strict=True):
-        planes = view.coordinates(level.surface, lattice, frame, at_nodes)
-        is_ortho = hasattr(view, "observation")
-        surface_of_image = reference if is_ortho else np.zeros((1, 1), np.float32)
-        with threads_for(u.shape):
-            sample_cells(view.image, planes, lattice.step, u, surface_of_image, cells)
-
-
-def _fit_exposures(level):
-    """Exposures that match the initial surface."""
-    _, _, sums = level.assemble(level.initial)
-    level.exposures[:] = _best_exposures(sums, level.exposures)
+def _look(level, u):
+    """The quadratic around ``u``; on the finest level the images are brought along."""
+    if level.stride == 1:
+        level.sample_images(u)
+    return level.expand(u)
 
 
 def _fit_albedo(level, u, priors):
@@ -472,8 +196,7 @@ def _fit_albedo(level, u, priors):
     level.albedo = fit_albedo(
         shading, level.cells, priors.noise, priors.albedo_contrast, level.albedo
     )
-    _, _, sums = level.assemble(u)
-    level.exposures[:] = _best_exposures(sums, level.exposures)
+    level.exposures[:] = best_exposures(level.assemble(u)[2], level.exposures)
 
 
 def _estimate_priors(level):
@@ -486,52 +209,6 @@ def _estimate_priors(level):
         return level.predict(level.initial + relief, k) - modelled[k]
 
     return estimate_priors(level.cells, residuals, gains, level.surface.grid.spacing, respond)
-
-
-def fill_holes(heights):
-    """Heights whose holes are closed by the thin plate through their surroundings.
-
-    Parameters
-    ----------
-    heights : float32 array (rows, cols), m; NaN in holes
-
-    Returns
-    -------
-    heights : float32 array (rows, cols), m
-    """
-    known = np.isfinite(heights)
-    if known.all():
-        return heights
-    start = _pull_push(heights)
-    rows, cols = heights.shape
-    none = np.zeros((rows - 1, cols - 1), np.float32)
-    plate = np.array([1.0, 2.0, 1.0], np.float32)
-    posts = np.where(known, np.float32(HOLD), np.float32(0))
-    bending = np.empty_like(start)
-    with threads_for(start.shape):
-        massless = np.zeros((1, cols), np.float32)
-        apply_operator(start, none, none, none, plate, np.float32(0), massless, bending)
-    equations = NormalEquations((none, none, none), plate, [0.0], posts)
-    change = conjugate_gradients(equations, -bending, FILL_REDUCTION, FILL_CYCLES).x
-    return np.where(known, heights, start + change)
-
-
-def _pull_push(heights):
-    """Holes filled with means of known posts around, from coarse grids."""
-    known = np.isfinite(heights)
-    if known.all():
-        return heights
-    if min(heights.shape) <= 2:
-        return np.where(known, heights, np.nanmean(heights)).astype(np.float32)
-    total = np.zeros(coarse_shape(heights.shape), np.float32)
-    weight = np.zeros_like(total)
-    restrict(np.where(known, heights, np.float32(0)).astype(np.float32), total)
-    restrict(known.astype(np.float32), weight)
-    missing = weight == 0
-    coarse = _pull_push(np.where(missing, np.nan, total / np.where(missing, 1, weight)))
-    filled = np.zeros_like(heights)
-    prolong_add(coarse.astype(np.float32), filled)
-    return np.where(known, heights, filled)
 
 
 def _outcome(converged, history):

@@ -11,7 +11,8 @@ from affine import Affine
 
 from lommel.core.reflectance import reflectance_model
 from lommel.errors import InputError
-from lommel.estimate.shape_from_shading import SolverSettings, fill_holes, solve_surface
+from lommel.estimate.holes import fill_holes
+from lommel.estimate.shape_from_shading import SolverSettings, solve_surface
 from lommel.estimate.surface import Surface
 from lommel.io.raster import write_raster
 from lommel.run.inputs import GridSettings, SceneFiles, Skipped, read_scene

@@ -1,0 +1,316 @@
+r"""One level of shape from shading: images on cells, light at nodes, cost and its derivatives.
+
+A `Problem` holds what a Gauss-Newton step needs on one grid of the coarse-to-fine hierarchy. Its
+data term sees the surface through the two slopes of each cell; its prior term acts on the
+difference to the expected surface. Most callers want `lommel.estimate.shape_from_shading`.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from lommel.core.multigrid import add_long_waves, coarse_masses, dot, threads_for
+from lommel.core.normal_operator import apply_operator, coarse_shape, restrict, slope_adjoint
+from lommel.estimate.shading_kernels import (
+    SUM_COST,
+    SUM_FF,
+    SUM_FM,
+    assemble,
+    eliminate_albedo,
+    predict,
+    sample_cells,
+)
+
+SLOPE_STEP = 0.01  # for the change of brightness with slope: R bends little over half a degree
+HUBER_SCALE = 3.0  # noise standard errors from which a residual counts as an outlier
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """Half the cost around a surface, to second order.
+
+    Attributes
+    ----------
+    cost : float
+        Data and priors.
+    tensors : float32 array (3, rows - 1, cols - 1)
+    gradient : float32 array (rows, cols)
+        Of data and priors with respect to the posts.
+    sums : float64 array (images, 8)
+    albedo : float32 array (rows - 1, cols - 1)
+        Best albedo for this surface.
+    """
+
+    cost: float
+    tensors: np.ndarray
+    gradient: np.ndarray
+    sums: np.ndarray
+    albedo: np.ndarray
+
+
+@dataclass
+class Problem:
+    """One level of the coarse-to-fine hierarchy."""
+
+    surface: object
+    model: object
+    views: list
+    exposures: np.ndarray
+    hazes: np.ndarray
+    weights: np.ndarray
+    stride: int
+    initial: np.ndarray
+    cells: list
+    albedo: np.ndarray
+    curvature: np.ndarray
+    masses: np.ndarray
+    slope: np.ndarray
+    expected: np.ndarray
+    albedo_error: float = 0.0
+    geometry: list = field(default_factory=list)
+
+    def prepare_geometry(self, u):
+        """Compute the lattice planes for the surface ``u``."""
+        distance = min(
+            np.linalg.norm(view.position) - self.surface.grid.body.radius for view in self.views
+        )
+        lattice = self.surface.lattice(u.shape, self.stride, distance)
+        at_nodes = lattice_heights(u, lattice)
+        frame = self.surface.frame(lattice, at_nodes)
+        gram = frame.gram.astype(np.float32)
+        lights = [light_planes(frame, view, self.model) for view in self.views]
+        self.geometry = [lattice, at_nodes, frame, gram, lights]
+
+    def expand(self, u):
+        """The `Quadratic` of half the cost around ``u``."""
+        tensors, gradient, sums, best, albedo_cost = self.assemble(u)
+        at_posts = np.empty_like(u)
+        with threads_for(u.shape):
+            slope_adjoint(gradient[0], gradient[1], at_posts)
+        prior, prior_cost = self.prior_gradient(u)
+        cost = (sums[:, SUM_COST].sum() + albedo_cost) / 2 + prior_cost
+        return Quadratic(float(cost), tensors, at_posts + prior, sums, best)
+
+    def assemble(self, u):
+        """Tensors, slope gradient, sums, best albedo and its cost at ``u``; data only."""
+        lattice, _, _, gram, lights = self.geometry
+        cells = (u.shape[0] - 1, u.shape[1] - 1)
+        tensors = np.zeros((3, *cells), np.float32)
+        gradient = np.zeros((2, *cells), np.float32)
+        shared = np.zeros((4, *cells), np.float32)
+        spacing = np.array(self.surface.grid.spacing, np.float32) * self.stride
+        parameters = self.model.parameter_array()
+        sums = np.zeros((len(self.views), 8))
+        with threads_for(u.shape):
+            for k, light in enumerate(lights):
+                weight = (
+                    self.weights[k] * self.stride**2
+                )  # a coarse cell averages stride^2 fine ones
+                softness = self.weights[k] / HUBER_SCALE**2
+                image = np.array([self.exposures[k], self.hazes[k], weight, softness], np.float32)
+                sums[k] = assemble(
+                    u,
+                    gram,
+                    light,
+                    lattice.step,
+                    spacing,
+                    self.model.kind,
+                    parameters,
+                    self.albedo,
+                    self.cells[k],
+                    image,
+                    tensors,
+                    gradient,
+                    shared,
+                )
+            best, albedo_cost = self.albedo, 0.0
+            if self.albedo_error > 0:
+                best = np.empty_like(self.albedo)
+                precision = np.float32(self.stride**2 / self.albedo_error**2)
+                albedo_cost = eliminate_albedo(
+                    self.albedo, tensors, gradient, shared, precision, best
+                )
+        tensors[0] += self.slope[0]
+        tensors[2] += self.slope[1]
+        return tensors, gradient, sums, best, albedo_cost
+
+    def predict(self, u, k):
+        """Modelled image ``k`` on the cells."""
+        lattice, _, _, gram, lights = self.geometry
+        out = np.empty((u.shape[0] - 1, u.shape[1] - 1), np.float32)
+        spacing = np.array(self.surface.grid.spacing, np.float32) * self.stride
+        image = np.array([self.exposures[k], self.hazes[k]], np.float32)
+        with threads_for(u.shape):
+            predict(
+                u,
+                gram,
+                lights[k],
+                lattice.step,
+                spacing,
+                self.model.kind,
+                self.model.parameter_array(),
+                self.albedo,
+                image,
+                out,
+            )
+        return out
+
+    def mean_gain(self, u, k):
+        """Mean change of image ``k`` with the slopes along columns and rows, image units."""
+        flat = np.zeros_like(u)
+        tilt = np.float32(SLOPE_STEP)
+        centre = self.predict(flat, k)
+        gains = []
+        for axis, spacing in ((1, self.surface.grid.spacing[1]), (0, self.surface.grid.spacing[0])):
+            shape = [1, 1]
+            shape[axis] = u.shape[axis]
+            ramp = tilt * np.float32(spacing) * np.arange(u.shape[axis], dtype=np.float32)
+            change = self.predict(np.ascontiguousarray(flat + ramp.reshape(shape)), k) - centre
+            gains.append(float(change.mean() / tilt))
+        return gains
+
+    def expect(self, priors):
+        """Take over priors: weights of every term, and the surface expected before the images."""
+        s_row, s_col = self.surface.grid.spacing
+        mean = (s_row * s_col) ** 0.5
+        self.weights = np.asarray(priors.noise, float) ** -2.0
+        curvature = np.array([1 / s_col**2, 2 / mean**2, 1 / s_row**2]) / priors.roughness**2
+        brightness = np.array([np.nanmean(cells) for cells in self.cells])
+        blur = (priors.albedo_contrast * np.median(brightness / priors.noise)) ** 2
+        self.curvature = curvature.astype(np.float32)
+        self.slope = (blur * curvature[[0, 2]]).astype(np.float32)
+        self.masses = np.asarray(priors.dem_errors, float) ** -2.0
+        self.expected = gaussian_filter(self.initial, priors.smoothing, mode="nearest")
+        self.albedo_error = priors.albedo_error
+
+    def prior_gradient(self, u):
+        """Gradient of the prior terms at ``u``, and their cost."""
+        rows, cols = u.shape
+        change = u - self.expected
+        along, across = (np.full((rows - 1, cols - 1), weight) for weight in self.slope)
+        none = np.zeros_like(along)
+        massless = np.zeros((1, cols), np.float32)
+        out = np.empty_like(u)
+        with threads_for(u.shape):
+            apply_operator(
+                change, along, none, across, self.curvature, np.float32(0), massless, out
+            )
+        cost = dot(change, out) / 2
+        cost += add_long_waves(change, self.masses, out) / 2
+        return out, cost
+
+    def sample_images(self, u):
+        """Bring every image onto the cells of the surface ``u``."""
+        lattice, at_nodes, frame, _, _ = self.geometry
+        for view, cells in zip(self.views, self.cells, strict=True):
+            planes = view.coordinates(self.surface, lattice, frame, at_nodes)
+            is_ortho = hasattr(view, "observation")
+            reference = self.initial if is_ortho else np.zeros((1, 1), np.float32)
+            with threads_for(u.shape):
+                sample_cells(view.image, planes, lattice.step, u, reference, cells)
+
+    def coarser(self):
+        """The same problem on every second post."""
+        coarse = replace(
+            self,
+            exposures=self.exposures.copy(),
+            stride=2 * self.stride,
+            initial=coarse_posts(self.initial),
+            expected=coarse_posts(self.expected),
+            cells=[coarse_cells(cells) for cells in self.cells],
+            albedo=np.nan_to_num(coarse_cells(self.albedo), nan=1.0),
+            curvature=self.curvature / 4,
+            masses=coarse_masses(self.masses, 1),
+        )
+        coarse.prepare_geometry(coarse.initial)
+        return coarse
+
+
+def fresh_problem(surface, initial, views, model, albedo):
+    """The finest level before images are sampled and priors known; see `solve_surface`."""
+    rows, cols = initial.shape
+    count = len(views)
+    if albedo is None:
+        albedo = np.ones((rows - 1, cols - 1), np.float32)
+    return Problem(
+        surface,
+        model,
+        views,
+        np.ones(count),
+        np.zeros(count),
+        np.ones(count),
+        1,
+        np.ascontiguousarray(initial, np.float32),
+        [np.empty((rows - 1, cols - 1), np.float32) for _ in views],
+        albedo,
+        curvature=np.zeros(3, np.float32),
+        masses=np.zeros(1),
+        slope=np.zeros(2, np.float32),
+        expected=initial,
+    )
+
+
+def light_planes(frame, view, model):
+    """Light and view along the normal's vectors, phase share and factor, at the nodes.
+
+    Parameters
+    ----------
+    frame : Frame
+    view : OrthoView or CameraView
+    model : ReflectanceModel
+
+    Returns
+    -------
+    planes : float32 array (8, node_rows, node_cols)
+    """
+    to_sun = view.sun_position - frame.xyz
+    to_sun /= np.linalg.norm(to_sun, axis=-1, keepdims=True)
+    to_camera = view.position - frame.xyz
+    to_camera /= np.linalg.norm(to_camera, axis=-1, keepdims=True)
+    phase = np.arccos(np.clip(np.einsum("...i,...i", to_sun, to_camera), -1, 1))
+    share, factor = model.phase_terms(phase)
+    planes = [np.einsum("...i,...i", frame.c[k], to_sun) for k in range(3)]
+    planes += [np.einsum("...i,...i", frame.c[k], to_camera) for k in range(3)]
+    return np.stack([*planes, share, factor]).astype(np.float32)
+
+
+def lattice_heights(u, lattice):
+    """Values of a post array at the nodes of a lattice, averaged over a cell of the lattice."""
+    half = max(lattice.step // 2, 0)
+    row = np.minimum((lattice.row[:, 0] / lattice.stride).astype(int), u.shape[0] - 1)
+    col = np.minimum((lattice.col[0] / lattice.stride).astype(int), u.shape[1] - 1)
+    total = np.zeros((row.size, col.size))
+    offsets = sorted({-half, 0, half})
+    for dr in offsets:
+        for dc in offsets:
+            rows = np.clip(row + dr, 0, u.shape[0] - 1)
+            cols = np.clip(col + dc, 0, u.shape[1] - 1)
+            total += u[rows[:, None], cols[None, :]]
+    return total / len(offsets) ** 2
+
+
+def coarse_cells(cells):
+    """Mean of 2x2 cells; NaN where one is missing or beyond the border."""
+    rows, cols = cells.shape
+    out = np.full(((rows + 1) // 2, (cols + 1) // 2), np.nan, np.float32)
+    even = cells[: rows // 2 * 2, : cols // 2 * 2]
+    out[: rows // 2, : cols // 2] = 0.25 * (
+        even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]
+    )
+    return out
+
+
+def coarse_posts(posts):
+    """Weighted mean around every second post."""
+    total = np.zeros(coarse_shape(posts.shape), np.float32)
+    weight = np.zeros_like(total)
+    restrict(np.ascontiguousarray(posts), total)
+    restrict(np.ones_like(posts), weight)
+    return total / weight
+
+
+def best_exposures(sums, exposures):
+    """Exposures that fit the images best, from the sums of `Problem.assemble`."""
+    has_data = sums[:, SUM_FF] > 0
+    return np.where(has_data, sums[:, SUM_FM] / np.where(has_data, sums[:, SUM_FF], 1), exposures)
