@@ -101,7 +101,7 @@ class Grid:
     @cached_property
     def spacing(self):
         """Ground distance between posts at the grid's centre: along rows' and columns' index, m."""
-        middle = np.array(self.shape) / 2
+        middle = (np.array(self.shape) - 1) / 2
         rows = middle[0] + np.array([[-0.5, 0.0], [0.5, 0.0]])
         cols = middle[1] + np.array([[0.0, -0.5], [0.0, 0.5]])
         xyz = to_xyz(self.body, *self.lonlat_at(rows, cols), 0.0)
