@@ -10,7 +10,7 @@ import numpy as np
 from lommel.errors import InputError
 
 ASTRONOMICAL_UNIT = 149_597_870_700.0  # m, IAU 2012 resolution B2
-LINE_LIMIT = 1_000_000  # lines; Apollo 15-17 together have 4010
+SIZE_LIMIT = 100_000_000  # characters; the table of Apollo 15-17 has 0.3 million
 
 
 def read_positions(path, kind, body, unit="auto"):
@@ -77,11 +77,16 @@ def find_position(positions, file_name, path):
 
 def _lines(path):
     try:
-        with open(path, encoding="utf-8") as file:
-            lines = file.readlines(LINE_LIMIT * 100)
+        with open(path, encoding="utf-8-sig") as file:
+            text = file.read(SIZE_LIMIT + 1)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path} cannot be read as a position table: {error}") from error
-    return lines
+    if len(text) > SIZE_LIMIT:
+        raise InputError(
+            f"{path} is larger than {SIZE_LIMIT} characters, which no position table is. "
+            "Check the path."
+        )
+    return text.splitlines()
 
 
 def _vector(words):
@@ -95,19 +100,22 @@ def _vector(words):
 def _metres_per_unit(path, positions, kind, body, unit):
     if unit not in ("auto", "m", "km"):
         raise InputError(f"unit = {unit!r} is not known. Choose auto, m or km.")
-    distances = np.linalg.norm(list(positions.values()), axis=1)
+    with np.errstate(over="ignore"):
+        distances = np.linalg.norm(list(positions.values()), axis=1)
     # The Sun is never nearer than 0.2 au or farther than 50 au from a body worth mapping;
     # a spacecraft is outside the body and within 100 radii. km and m cannot both fit.
     near, far = {
         "sun": (0.2 * ASTRONOMICAL_UNIT, 50 * ASTRONOMICAL_UNIT),
         "spacecraft": (body.radius, 100 * body.radius),
     }[kind]
+    if unit != "auto":  # whoever names the unit may stand anywhere outside the body
+        near, far = body.radius, np.inf
     for scale, name in ((1000.0, "km"), (1.0, "m")):
         metres = scale * distances
-        is_plausible = bool(((near < metres) & (metres < far)).all())
-        if unit == name or (unit == "auto" and is_plausible):
+        if unit in ("auto", name) and ((near < metres) & (metres < far)).all():
             return scale
+    allowed = "neither in km nor in m" if unit == "auto" else f"not in {unit}"
     raise InputError(
         f"{path}: distances from {distances.min():.4g} to {distances.max():.4g} are those of a "
-        f"{kind} position neither in km nor in m. Check the table, or name its unit."
+        f"{kind} position {allowed}. Check the table, or name its unit."
     )
