@@ -38,7 +38,7 @@ def read_tsai(path, shape):
         raise InputError(
             f"{path}: u, v and w_direction must be the unit axes 1 0 0, 0 1 0 and 0 0 1."
         )
-    pitch, fu, fv, cu, cv = (values[key][0] for key in ("pitch", "fu", "fv", "cu", "cv"))
+    pitch, fu, fv, cu, cv = (float(values[key][0]) for key in ("pitch", "fu", "fv", "cu", "cv"))
     if not (pitch > 0 and fu == fv):
         raise InputError(
             f"{path}: pitch = {pitch} must be positive, and fu = {fu} equal to fv = {fv}."

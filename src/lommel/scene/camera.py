@@ -94,15 +94,16 @@ class FrameCamera(Camera):
 
     def __post_init__(self):
         """Check that the rotation is one."""
-        product = self.rotation @ self.rotation.T
-        if np.abs(product - np.eye(3)).max() > ORTHOGONALITY or np.linalg.det(self.rotation) < 0:
+        with np.errstate(over="ignore", invalid="ignore"):
+            deviation = np.abs(self.rotation @ self.rotation.T - np.eye(3)).max()
+        if not (deviation <= ORTHOGONALITY and np.linalg.det(self.rotation) > 0):
             raise InputError(
                 "rotation is not a rotation: its rows must be orthogonal unit vectors that form "
                 "a right-handed frame. Check the camera file."
             )
-        if not self.focal_length > 0:
+        if not 0 < self.focal_length < np.inf:
             raise InputError(
-                f"focal_length = {self.focal_length} is not positive. Give it in pixels."
+                f"focal_length = {self.focal_length} is not positive and finite. Give it in pixels."
             )
 
     def project(self, xyz):
