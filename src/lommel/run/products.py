@@ -11,14 +11,14 @@ import platform
 import resource
 import shutil
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from lommel import __version__
-from lommel.errors import InputError
+from lommel.errors import InputError, LommelError
 
 PACKAGES = ("numpy", "numba", "scipy", "rasterio", "pyproj")
 
@@ -31,23 +31,18 @@ def output_folder(path, overwrite=False):
     ----------
     path : path
     overwrite : bool
-        Replace a folder that exists; without it an existing folder is an error.
+        Replace the folder of an earlier run; without it a folder that holds something is an error.
 
     Yields
     ------
     staging : Path
         Where to write.
     """
-    path = Path(path).absolute()
-    if path.is_file():
-        raise InputError(f"--output {path} is a file. Name a folder.")
-    if path.exists() and any(path.iterdir()) and not overwrite:
-        raise InputError(
-            f"--output {path} exists and is not empty. Name another folder, or replace it "
-            "with --overwrite."
-        )
+    path = Path(os.path.realpath(path))
     staging = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    new_parents = [parent for parent in path.parents if not parent.exists()]
     try:
+        _refuse_filled(path, overwrite)
         shutil.rmtree(staging, ignore_errors=True)
         staging.mkdir(parents=True)
     except OSError as error:
@@ -57,13 +52,49 @@ def output_folder(path, overwrite=False):
         ) from error
     try:
         yield staging
-        replaced = path.with_name(f".{path.name}.{os.getpid()}.replaced")
-        if path.exists():
-            path.rename(replaced)
-        staging.rename(path)
-        shutil.rmtree(replaced, ignore_errors=True)
-    finally:
+    except BaseException:
         shutil.rmtree(staging, ignore_errors=True)
+        for parent in new_parents:
+            with suppress(OSError):
+                parent.rmdir()
+        raise
+    _take_name(staging, path, overwrite)
+
+
+def _refuse_filled(path, overwrite):
+    """Keep what exists, but for an empty folder, or with ``overwrite`` that of an earlier run."""
+    if path.exists() and not path.is_dir():
+        raise InputError(f"--output {path} is a file. Name a folder.")
+    if not path.exists() or not any(path.iterdir()):
+        return
+    if not overwrite:
+        raise InputError(
+            f"--output {path} exists and is not empty. Name another folder, or replace it "
+            "with --overwrite."
+        )
+    if not (path / "run.json").is_file():
+        raise InputError(
+            f"--output {path} holds no run.json, so it is not the folder of an earlier run. "
+            "--overwrite replaces whole folders: name another one."
+        )
+
+
+def _take_name(staging, path, overwrite):
+    """Rename the folder to ``path``; whatever fails, what stood there stands there again."""
+    replaced = path.with_name(f".{path.name}.{os.getpid()}.replaced")
+    try:
+        if overwrite and path.exists():
+            path.rename(replaced)
+        staging.rename(path)  # an empty folder gives way; one that was filled meanwhile does not
+    except OSError as error:
+        raise LommelError(
+            f"--output {path} could not be put in place: {error}. The products are whole and "
+            f"wait in {staging}: rename that folder."
+        ) from error
+    finally:
+        if replaced.exists() and not path.exists():
+            replaced.rename(path)
+    shutil.rmtree(replaced, ignore_errors=True)
 
 
 @dataclass
