@@ -14,6 +14,7 @@ from typing import Annotated
 import click
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from lommel import __version__
@@ -25,7 +26,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Albedo maps, exposures and refined terrain from orbital images of airless bodies.",
 )
-log = Console(stderr=True, highlight=False)
+log = Console(stderr=True, highlight=False, emoji=False)
 
 Images = Annotated[
     list[Path], typer.Argument(help="Orthoimages: any raster GDAL reads that has a CRS.")
@@ -266,15 +267,11 @@ def main():
         error.show()
         sys.exit(2)
     except InputError as error:
-        log.print(f"[bold red]error[/] {_plain(error)}", soft_wrap=True)
+        log.print(f"[bold red]error[/] {escape(str(error))}", soft_wrap=True)
         sys.exit(2)
     except LommelError as error:
-        log.print(f"[bold red]failed[/] {_plain(error)}", soft_wrap=True)
+        log.print(f"[bold red]failed[/] {escape(str(error))}", soft_wrap=True)
         sys.exit(1)
-
-
-def _plain(error):
-    return str(error).replace("[", r"\\[")
 
 
 def _files(images, dems, sun_positions, spacecraft_positions, unit):
@@ -309,8 +306,8 @@ def _finish(output):
     page = write_report(output)
     record = json.loads((output / "run.json").read_text(encoding="utf-8"))
     for skip in record["skipped"]:
-        log.print(f"[yellow]left out[/] {_plain(skip['reason'])}", soft_wrap=True)
-    log.print(record["outcome"]["sentence"], soft_wrap=True)
+        log.print(f"[yellow]left out[/] {escape(skip['reason'])}", soft_wrap=True)
+    log.print(escape(record["outcome"]["sentence"]), soft_wrap=True)
     for name, value in record["results"].items():
         log.print(
             f"  {name:40} {value:.5g}" if isinstance(value, float) else f"  {name:40} {value}"

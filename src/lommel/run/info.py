@@ -38,7 +38,7 @@ def describe(path, sun_positions=None, spacecraft_positions=None, body=MOON):
         "cols": info.shape[1],
         "bands": info.bands,
         "dtype": info.dtype,
-        "nodata": info.nodata,
+        "nodata": str(info.nodata) if info.nodata is not None else None,  # may be nan
         "mask": "second band" if info.has_mask_band else None,
         "crs": info.grid.crs.name if info.grid else None,
     }
