@@ -120,7 +120,9 @@ def test_unused_images_are_listed_with_the_reason(demo_report):
 
 
 def test_missing_products_are_left_out(tmp_path):
-    (tmp_path / "run.json").write_text('{"command": "albedo"}', encoding="utf-8")
+    (tmp_path / "run.json").write_text(
+        '{"command": "albedo", "outcome": {"sentence": "Stopped."}}', encoding="utf-8"
+    )
     page = Page(write_report(tmp_path))
     assert page.attributes("img") == []
     assert "Albedo and exposures" in page.text
@@ -169,6 +171,12 @@ def test_broken_record_is_refused_with_a_remedy(tmp_path, content, message):
 def test_foreign_exposure_table_is_refused(albedo_folder):
     (albedo_folder / "exposures.csv").write_text("name,value\na,1\n", encoding="utf-8")
     with pytest.raises(InputError, match="columns name, value; the report needs image"):
+        write_report(albedo_folder)
+
+
+def test_damaged_exposure_table_is_refused(albedo_folder):
+    (albedo_folder / "exposures.csv").write_bytes(b"image,exposure\n\xff\xfe,1\n")
+    with pytest.raises(InputError, match=r"exposures\.csv cannot be read"):
         write_report(albedo_folder)
 
 

@@ -116,8 +116,13 @@ def _read_record(path):
 
 
 def _read_exposures(path):
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, ValueError, csv.Error) as error:
+        raise InputError(
+            f"{path} cannot be read: {error}. Repeat the run that wrote it."
+        ) from error
     if rows and not {"image", "exposure"} <= set(rows[0]):
         raise InputError(
             f"{path} has the columns {', '.join(map(str, rows[0]))}; the report needs image and "
