@@ -25,6 +25,8 @@ ROUGHNESS_OCTAVES = slice(1, 4)  # the shortest octave is dulled by the pixels' 
 # large one of height: 0.07 % of the brightness per octave is a contrast of 0.2 % per post.
 LEAST_CONTRAST = 0.002
 KNOWN_SHARE = 1.0  # of the terrain's power: the DEM knows the octaves in which it errs by less
+LEAST_DIVERSITY = 0.1  # below it images under nearly one Sun cannot tell albedo from slope
+ALBEDO_ERROR = 0.1  # of a cell's albedo about 1, rms; mare against highland reaches twice that
 # Craters bend more light than random relief of the same spectrum: up to this factor
 BEND_MARGIN = 8.0
 
@@ -110,6 +112,9 @@ def estimate_priors(cells, residuals, gains, spacing, respond):
     excess = np.maximum(observed - BEND_MARGIN * bend - noise[:, None] ** 2, 0.0)
     contrasts = np.median(np.sqrt(excess) * k / brightness[:, None], axis=0)
     contrast = max(float(contrasts[2:].min()), LEAST_CONTRAST)
+    tells_albedo = _diversity(np.array(gains) / brightness[:, None]) > LEAST_DIVERSITY
+    if tells_albedo:  # the images themselves hold albedo and slope apart: no need to doubt them
+        contrast = LEAST_CONTRAST
     # albedo at long waves drowns the slopes: the relief counts less there by this factor
     drowned = 1 + (contrast * np.median(brightness / noise) / k) ** 2
     level = np.median((terrain * k**4)[ROUGHNESS_OCTAVES])
@@ -122,7 +127,14 @@ def estimate_priors(cells, residuals, gains, spacing, respond):
         albedo_contrast=contrast,
         dem_errors=_dem_errors(drowned / relief, first),
         smoothing=2.0**first / 2,
+        albedo_error=ALBEDO_ERROR if tells_albedo else 0.0,
     )
+
+
+def _diversity(relative_gains):
+    """Share of the slope signal that is left when every cell may have its own albedo."""
+    apart = relative_gains - relative_gains.mean(axis=0)
+    return float((apart**2).sum() / max((relative_gains**2).sum(), 1e-30))
 
 
 def _bend_spectra(relief, gains, spacing, respond, shape):
