@@ -8,6 +8,7 @@ rasterio lives in this module only. Most callers want `read_on_grid` and `write_
 
 import os
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,18 +16,21 @@ import numpy as np
 import rasterio
 import rasterio.shutil
 from affine import Affine
+from rasterio._err import CPLE_BaseError
 from rasterio.enums import ColorInterp, Resampling
-from rasterio.errors import NotGeoreferencedWarning, RasterioError, RasterioIOError
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.warp import reproject
 from rasterio.windows import Window as FileWindow
 
-from lommel.errors import GeometryError, InputError
+from lommel.errors import InputError
 from lommel.scene.body import MOON
 from lommel.scene.grid import Grid, Window, read_crs
 
 PIXEL_LIMIT = 2**34  # pixels of one raster side by side; beyond it the header is not believable
 DOWNSAMPLING = 1.5  # input pixels per post from which area means replace interpolation
 CLIPPED_8_BIT = (0.0, 255.0)  # image values that only say "at most" and "at least"
+GDAL_ERRORS = (RasterioError, CPLE_BaseError, OSError)  # rasterio lets some of GDAL's own pass
+SPECIAL = 1e38  # ISIS marks missing pixels by values beyond it, double nodata is cut down to it
 MARGIN = 4  # pixels read around a window so that interpolation sees its neighbours
 
 
@@ -78,6 +82,8 @@ def raster_info(path, body=MOON):
     """
     with _open(path) as file:
         rows, cols = file.shape
+        if file.count == 0:
+            raise InputError(f"{path} holds no band of its own. Name one of its parts.")
         if rows * cols > PIXEL_LIMIT:
             raise InputError(
                 f"{path}: the header claims {rows} x {cols} pixels, more than {PIXEL_LIMIT}. "
@@ -100,7 +106,7 @@ def read_grid(path, body=MOON):
     """The grid of a map-projected raster; an error when it has no CRS."""
     grid = raster_info(path, body).grid
     if grid is None:
-        raise GeometryError(
+        raise InputError(
             f"{path} has no CRS or no transform, so its place is unknown. Assign one with "
             "gdal_edit.py -a_srs and -a_ullr, or give a map-projected raster."
         )
@@ -124,17 +130,18 @@ def read_pixels(path, window=None):
         window = window or Window(0, 0, *file.shape)
         part = FileWindow(window.col, window.row, window.cols, window.rows)
         try:
-            values = file.read(1, window=part).astype(np.float32)
+            values = file.read(1, window=part)
             missing = file.read_masks(1, window=part) == 0
             if _has_mask_band(file):
                 missing |= file.read(2, window=part) == 0
-        except (RasterioError, ValueError) as error:
+        except (*GDAL_ERRORS, ValueError) as error:
             raise InputError(f"{path} cannot be read, it may be truncated: {error}") from error
         scale, offset = file.scales[0], file.offsets[0]
-    if (scale, offset) != (1.0, 0.0):
-        values = np.float32(scale) * values + np.float32(offset)
-    values[missing | ~np.isfinite(values)] = np.nan
-    return values
+    values = np.clip(values, -SPECIAL, SPECIAL, dtype=np.float32)
+    values[missing | ~(np.abs(values) < SPECIAL)] = np.nan
+    return (
+        values if (scale, offset) == (1.0, 0.0) else np.float32(scale) * values + np.float32(offset)
+    )
 
 
 def read_image_on_grid(path, grid, body=MOON):
@@ -212,6 +219,8 @@ def resample(values, source, grid, interpolation=Resampling.cubic):
         "dst_nodata": np.nan,
         "tolerance": 0.0,  # exact transform at every post: the default errs by 1/8 pixel
     }
+    if not is_finer:  # else GDAL blurs what lies at the seam of a global raster
+        frames |= {"XSCALE": 1.0, "YSCALE": 1.0}
     reproject(values, result, resampling=method, **frames)
     if not is_finer and np.isnan(values).any():  # kernels reach 2 pixels: restore the hole's shape
         nearest = np.full(grid.shape, np.nan, np.float32)
@@ -268,7 +277,7 @@ def read_preview(path, size, body=MOON):
                 resampling=Resampling.average,
                 masked=True,
             ).filled(np.nan)
-        except (RasterioError, ValueError) as error:
+        except (*GDAL_ERRORS, ValueError) as error:
             raise InputError(f"{path} cannot be read, it may be truncated: {error}") from error
         unit = file.units[0] or ""
     rows, cols = grid.shape
@@ -328,10 +337,11 @@ def write_raster(path, values, grid, description, unit="", nodata=np.nan, valid=
                     num_threads=2,
                 )
         os.replace(partial, path)
-    except (RasterioError, OSError) as error:
+    except GDAL_ERRORS as error:
         raise InputError(f"{path} cannot be written: {error}") from error
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):
+            partial.unlink()
 
 
 def _open(path):
@@ -339,7 +349,7 @@ def _open(path):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             return rasterio.open(path)
-    except RasterioIOError as error:
+    except GDAL_ERRORS as error:
         reason = "there is no such file" if not Path(path).exists() else str(error)
         raise InputError(f"{path} cannot be opened as a raster: {reason}") from error
 
@@ -351,7 +361,8 @@ def _has_mask_band(file):
 
 
 def _grid_of(file, path, body):
-    if file.crs is None or file.transform.is_identity:
+    is_usable = np.isfinite(file.transform).all() and not file.transform.is_degenerate
+    if file.crs is None or file.transform.is_identity or not is_usable:
         return None
     return Grid(file.shape, file.transform, read_crs(file.crs.to_wkt(), body, str(path)), body)
 
