@@ -24,9 +24,9 @@ ROUGHNESS_OCTAVES = slice(1, 4)  # the shortest octave is dulled by the pixels' 
 # Photometric models and calibrations err at long waves, where a small error of brightness is a
 # large one of height: 0.07 % of the brightness per octave is a contrast of 0.2 % per post.
 LEAST_CONTRAST = 0.002
-KNOWN_SHARE = 1.0  # of the terrain's power: the DEM knows the octaves in which it errs by less
+KNOWN_SHARE = 0.85  # of the terrain's power: the DEM knows the octaves in which it errs by less
 LEAST_DIVERSITY = 0.1  # below it images under nearly one Sun cannot tell albedo from slope
-ALBEDO_ERROR = 0.1  # of a cell's albedo about 1, rms; mare against highland reaches twice that
+ALBEDO_ERROR = 0.3  # of a cell's albedo about 1, rms: mare against highland
 # Craters bend more light than random relief of the same spectrum: up to this factor
 BEND_MARGIN = 8.0
 
@@ -119,8 +119,10 @@ def estimate_priors(cells, residuals, gains, spacing, respond):
     drowned = 1 + (contrast * np.median(brightness / noise) / k) ** 2
     level = np.median((terrain * k**4)[ROUGHNESS_OCTAVES])
     mean_spacing = (spacing[0] * spacing[1]) ** 0.5
-    is_unknown = relief[:-1] > KNOWN_SHARE * level / k[:-1] ** 4
+    is_unknown = relief[:-1] > KNOWN_SHARE * terrain[:-1]
     first = int(np.flatnonzero(is_unknown).max(initial=-1)) + 1
+    # a DEM that knows the hills does not err more on longer waves; what looks so is albedo
+    relief[first:] = np.minimum.accumulate(relief[first:])
     return Priors(
         noise=noise,
         roughness=float(level**0.5 / mean_spacing),
@@ -175,30 +177,39 @@ def separate(image, gain, spacing):
     -------
     spectra : Spectra
     """
+    power, k_row, k_col = _periodogram(image)
+    along = gain[0] / spacing[1] * 2 * np.sin(k_col / 2) * np.cos(k_row / 2)
+    along = along + gain[1] / spacing[0] * 2 * np.sin(k_row / 2) * np.cos(k_col / 2)
+    centres, relief, noise = [], [], []
+    for centre, inside, fall in _octaves(k_row, k_col):
+        p, n = _fit_two_spectra(power[inside], along[inside] ** 2 * fall)
+        centres.append(centre)
+        relief.append(p)
+        noise.append(n)
+    return Spectra(np.array(centres), np.array(relief), np.array(noise))
+
+
+def _periodogram(image):
+    """Windowed power of the central tile and its wave numbers, rad per post."""
     tile = _central_tile(image)
-    window = np.hanning(tile.shape[0])[:, None] * np.hanning(tile.shape[1])[None, :]
     known = np.isfinite(tile)
-    window = np.where(known, window, 0.0)
+    window = np.hanning(tile.shape[0])[:, None] * np.hanning(tile.shape[1])[None, :] * known
     tile = np.where(known, tile, 0.0)
     tile = (tile - (window * tile).sum() / max(window.sum(), 1e-12)) * window
     power = np.abs(np.fft.rfft2(tile)) ** 2 / max((window**2).sum(), 1e-12)
     k_row = 2 * np.pi * np.fft.fftfreq(tile.shape[0])[:, None]
     k_col = 2 * np.pi * np.fft.rfftfreq(tile.shape[1])[None, :]
+    return power, k_row, k_col
+
+
+def _octaves(k_row, k_col):
+    """Centre, members, and the fall of terrain as k^-4 within, of each octave."""
     k = np.hypot(k_row, k_col)
-    along = gain[0] / spacing[1] * 2 * np.sin(k_col / 2) * np.cos(k_row / 2)
-    along = along + gain[1] / spacing[0] * 2 * np.sin(k_row / 2) * np.cos(k_col / 2)
-    octaves = int(np.log2(min(tile.shape))) - 2
-    centres, relief, noise = [], [], []
-    for octave in range(octaves):
+    for octave in range(int(np.log2(min(k_row.size, 2 * k_col.size - 1))) - 2):
         high = np.pi / 2**octave
         inside = (k >= high / 2) & (k < high)
         centre = high / 2**0.5
-        signal = along[inside] ** 2 * (centre / k[inside]) ** 4  # terrain falls as k^-4
-        p, n = _fit_two_spectra(power[inside], signal)
-        centres.append(centre)
-        relief.append(p)
-        noise.append(n)
-    return Spectra(np.array(centres), np.array(relief), np.array(noise))
+        yield centre, inside, (centre / k[inside]) ** 4
 
 
 def _fit_two_spectra(power, signal):
