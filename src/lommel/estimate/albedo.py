@@ -29,7 +29,7 @@ from scipy.sparse.linalg import splu
 
 from lommel.core.reflectance import reflectance_model
 from lommel.errors import InputError
-from lommel.estimate.albedo_arrays import OWN, SHARED, Maps, State
+from lommel.estimate.albedo_arrays import OWN, SHARED, State
 from lommel.estimate.albedo_equations import (
     PIN,
     Problem,
@@ -41,11 +41,12 @@ from lommel.estimate.albedo_equations import (
     visit,
 )
 from lommel.estimate.albedo_quality import disagreement
-from lommel.estimate.albedo_rows import LEAST_SQUARES
 from lommel.estimate.albedo_samples import collect_samples, orthomosaic, overlapping_pairs
 from lommel.estimate.albedo_settings import AlbedoSettings, check_settings
 
-SETTLING = 4  # passes after which noise scale and repetition are kept, so that the cost is one
+SETTLED = 0.02  # change of the log noise scale from which scale and repetition are kept
+SETTLING = 8  # passes at most until then; from there on the cost keeps its meaning
+LONGEST = 0.5  # change of any unknown in one step; all are logarithms or of order 1
 FREE_SHARE = 4.0  # images whose scatter the overall noise counts for in the error of one post
 
 
@@ -153,27 +154,26 @@ def _iterate(problem, levels, progress):
         _mean_brightness(problem.samples),
         problem.shared_start,
     )
-    maps = Maps(*(np.zeros(problem.shape) for _ in range(5)), np.zeros(problem.shape, np.int32))
-    point = visit(problem, state, 0.0, 1.0, 1.0, maps, LEAST_SQUARES)
-    settling = (
-        SETTLING if settings.loss != "least-squares" or settings.solver == "projection" else 0
-    )
-    damping, history = 0.0, []
+    point = visit(problem, state, np.log(levels.mean()), 1.0, 1.0)
+    is_settled = settings.solver == "alternating" and settings.loss == "least-squares"
+    damping, history, change = 0.0, [], np.inf
     for step in range(settings.max_steps):
         scale, repetition = point.scale, point.repetition
-        if step < settling:
+        if not is_settled:
             scale, repetition = _weighting(point)
+            is_settled = abs(np.log(scale / point.scale)) < SETTLED or step >= SETTLING
+            repetition = repetition if is_settled else 1.0
         moved, mean = _step(problem, point, damping)
-        trial = visit(problem, moved, mean, scale, repetition, _copy(point.maps), None)
+        trial = visit(problem, moved, mean, scale, repetition)
         progress(step + 1, trial.objective)
-        if step < settling:  # the cost changes its meaning from pass to pass
-            point = trial
+        if (scale, repetition) != (point.scale, point.repetition):
+            point = trial  # the cost has changed its meaning
             continue
         change = (trial.objective - point.objective) / max(abs(point.objective), 1e-300)
         if change <= 0:
-            point, damping = trial, damping / 10
+            point, damping = trial, damping / 4
         else:
-            damping = max(10 * damping, 1e-3)
+            damping = max(4 * damping, 1e-3)
         history.append({"step": step + 1, "cost": point.objective, "change": change})
         if abs(change) < settings.tolerance:
             return point, history, "converged", f"Converged after {step + 1} passes."
@@ -196,10 +196,6 @@ def _mean_brightness(samples):
     return np.add.reduceat(samples.weight.astype(float) * samples.measured, samples.starts) / weight
 
 
-def _copy(maps):
-    return Maps(*(plane.copy() for plane in maps))
-
-
 def _step(problem, point, damping):
     """The next state and mean log albedo."""
     change = np.zeros(problem.is_fitted.size)
@@ -211,17 +207,15 @@ def _step(problem, point, damping):
         matrix = matrix[fitted][:, fitted].tocsc()
         matrix.setdiag(matrix.diagonal() * (1.0 + damping + PIN))
         change[fitted] = -splu(matrix).solve(gradient[fitted])
+        change *= min(1.0, LONGEST / np.abs(change).max())
     own = change[: OWN * problem.images].reshape(-1, OWN)
     state = point.state
-    exposure = state.exposure * np.exp(np.clip(own[:, 0], -1.0, 1.0))
+    exposure = state.exposure * np.exp(own[:, 0])
     if problem.settings.solver == "alternating":  # step 3 is linear in T
         exposure = state.exposure * (1.0 + own[:, 0])
-    moved = State(
-        exposure,
-        state.haze + state.level * own[:, 1],
-        state.level,
-        state.shared + change[-SHARED - 1 : -1],
-    )
+    shared = state.shared + change[-SHARED - 1 : -1]
+    shared[1] = max(shared[1], 0.0)  # a negative c2 could make the brightness negative
+    moved = State(exposure, state.haze + state.level * own[:, 1], state.level, shared)
     return moved, point.mean_log_albedo + change[-1]
 
 

@@ -175,3 +175,8 @@ def empty_sums(images, pairs):
         histogram=np.zeros((BLOCKS, SCALE_BINS)),
         cost=np.zeros(BLOCKS),
     )
+
+
+def empty_maps(shape):
+    """Maps of nothing."""
+    return Maps(*(np.zeros(shape) for _ in range(5)), np.zeros(shape, np.int32))

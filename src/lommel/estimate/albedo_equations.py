@@ -23,6 +23,7 @@ from lommel.estimate.albedo_arrays import (
     Samples,
     State,
     Sums,
+    empty_maps,
     empty_sums,
 )
 from lommel.estimate.albedo_kernels import accumulate
@@ -86,10 +87,11 @@ class Point:
     objective: float
 
 
-def visit(problem, state, mean_log_albedo, scale, repetition, maps, loss):
-    """One pass over the images; the robust weights come from the albedo in ``maps``."""
-    loss = LOSSES[problem.settings.loss] if loss is None else loss
+def visit(problem, state, mean_log_albedo, scale, repetition):
+    """One pass over the images: the sums, maps and objective at these parameters."""
     blocks = empty_sums(problem.images, len(problem.pairs.second))
+    maps = empty_maps(problem.shape)
+    loss = LOSSES[problem.settings.loss]
     accumulate(problem.samples, problem.pairs, state, scale, loss, maps, blocks)
     sums = Sums(*(part.sum(axis=0) for part in blocks))
     point = Point(state, mean_log_albedo, scale, repetition, maps, sums, 0.0)

@@ -19,6 +19,7 @@ from numba import njit, prange
 
 from lommel.estimate.albedo_arrays import BLOCKS, OWN, PATCHES, SHARED, Sums, Work
 from lommel.estimate.albedo_rows import (
+    LEAST_SQUARES,
     brightness_row,
     count_row,
     dot3,
@@ -29,54 +30,70 @@ from lommel.estimate.albedo_rows import (
     weigh_row,
 )
 
+SWEEPS = 5  # weightings of the pixels of a post; the robust mean then moves below 1e-3 of its error
+
 
 @njit(cache=True, error_model="numpy")
-def _first_sweep(
-    row, samples, images, state, scale, loss, work, albedo, bottom, spread, freedom, count
-):
-    """Brightness and robust weights of every image in this row, then the best albedo."""
-    top = work.top
-    top[:], bottom[:], spread[:], freedom[:], count[:] = 0.0, 0.0, 0.0, 0.0, 0
+def _first_sweep(row, samples, images, state, work, maps):
+    """Brightness of every image in this row, and how many there are."""
+    count, freedom = maps.image_count[row], maps.freedom[row]
+    count[:], freedom[:] = 0, 0.0
     for a in range(images.size):
         k = images[a]
         first, width, part = _place(samples, k, row)
         cols = slice(first, first + width)
-        brightness = work.brightness[a, :width]
         brightness_row(
             samples.reflectance[part],
             samples.phase[part],
             samples.off_axis[part],
             state.exposure[k],
             state.shared,
-            brightness,
+            work.brightness[a, :width],
             work.derivatives[a, :, :width],
         )
-        weight = samples.weight[part]
-        weigh_row(
-            samples.measured[part],
-            weight,
-            samples.precision[part],
-            brightness,
-            state.haze[k],
-            albedo[cols],
-            scale,
-            loss,
-            work.w[a, :width],
-            top[cols],
-            bottom[cols],
-            spread[cols],
-        )
-        count_row(weight, count[cols], freedom[cols])
-    for j in range(albedo.size):
-        work.inverse[j] = 1.0 / bottom[j] if bottom[j] > 0.0 else 0.0
-        albedo[j] = top[j] * work.inverse[j]
+        count_row(samples.weight[part], count[cols], freedom[cols])
+    for j in range(count.size):
         if count[j] > 0:
             freedom[j] *= (count[j] - 1) / count[j]
 
 
 @njit(cache=True, error_model="numpy")
-def _second_sweep(row, samples, images, state, scale, loss, work, sums, albedo, scatter, count):
+def _best_albedo(row, samples, images, state, scale, loss, work, maps):
+    """Albedo of this row by repeated weighting, from the plain weighted mean on.
+
+    It depends on the image parameters alone, not on the pass before, so that the cost is a function
+    of these parameters.
+    """
+    albedo, bottom, spread = maps.albedo[row], maps.information[row], maps.spread[row]
+    for sweep in range(1 if loss == LEAST_SQUARES else SWEEPS):
+        work.top[:], bottom[:], spread[:] = 0.0, 0.0, 0.0
+        for a in range(images.size):
+            k = images[a]
+            first, width, part = _place(samples, k, row)
+            cols = slice(first, first + width)
+            weigh_row(
+                samples.measured[part],
+                samples.weight[part],
+                samples.precision[part],
+                work.brightness[a, :width],
+                state.haze[k],
+                albedo[cols],
+                scale,
+                loss if sweep > 0 else LEAST_SQUARES,
+                work.w[a, :width],
+                work.top[cols],
+                bottom[cols],
+                spread[cols],
+            )
+        for j in range(albedo.size):
+            work.inverse[j] = 1.0 / bottom[j] if bottom[j] > 0.0 else 0.0
+            albedo[j] = work.top[j] * work.inverse[j]
+
+
+@njit(cache=True, error_model="numpy")
+def _second_sweep(row, samples, images, state, scale, loss, work, sums, maps):
     """Sums of every image in this row, given the albedo."""
+    albedo, scatter, count = maps.albedo[row], maps.scatter[row], maps.image_count[row]
     work.u_shared[:] = 0.0
     scatter[:] = 0.0
     for a in range(images.size):
@@ -253,7 +270,7 @@ def accumulate(samples, pairs, state, scale, loss, maps, sums):
     loss : int
         LEAST_SQUARES, HUBER or CAUCHY.
     maps : Maps
-        The albedo of the pass before (robust weights come from it) is replaced.
+        Overwritten.
     sums : Sums
         Zeros from `empty_sums`; added to.
     """
@@ -268,22 +285,7 @@ def accumulate(samples, pairs, state, scale, loss, maps, sums):
             place_of = np.empty(samples.starts.size, np.int64)
             for row in range(first_row, last_row):
                 images = _images_in(row, samples, place_of)
-                albedo, scatter, count = maps.albedo[row], maps.scatter[row], maps.image_count[row]
-                _first_sweep(
-                    row,
-                    samples,
-                    images,
-                    state,
-                    scale,
-                    loss,
-                    work,
-                    albedo,
-                    maps.information[row],
-                    maps.spread[row],
-                    maps.freedom[row],
-                    count,
-                )
-                _second_sweep(
-                    row, samples, images, state, scale, loss, work, here, albedo, scatter, count
-                )
+                _first_sweep(row, samples, images, state, work, maps)
+                _best_albedo(row, samples, images, state, scale, loss, work, maps)
+                _second_sweep(row, samples, images, state, scale, loss, work, here, maps)
                 _eliminate(samples, images, pairs, place_of, work, here)

@@ -50,7 +50,7 @@ class AlbedoSettings:
     fit_phase_factor: bool = True
     fit_falloff: bool = True
     slope_noise: float | None = 0.5
-    albedo_contrast: float = 0.1
+    albedo_contrast: float = 0.05
     haze_error: float = 0.1
     masks: MaskSettings = field(default_factory=MaskSettings)
     max_steps: int = 30
