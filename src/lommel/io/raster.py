@@ -24,12 +24,12 @@ from rasterio.windows import Window as FileWindow
 
 from lommel.errors import InputError
 from lommel.scene.body import MOON
-from lommel.scene.grid import Grid, Window, read_crs
+from lommel.scene.grid import LEAST_SPACING, Grid, Window, read_crs
 
 PIXEL_LIMIT = 2**34  # pixels of one raster side by side; beyond it the header is not believable
 DOWNSAMPLING = 1.5  # input pixels per post from which area means replace interpolation
 CLIPPED_8_BIT = (0.0, 255.0)  # image values that only say "at most" and "at least"
-GDAL_ERRORS = (RasterioError, CPLE_BaseError, OSError)  # rasterio lets some of GDAL's own pass
+GDAL_ERRORS = (RasterioError, CPLE_BaseError, OSError, ValueError)  # rasterio mixes them
 SPECIAL = 1e38  # ISIS marks missing pixels by values beyond it, double nodata is cut down to it
 MARGIN = 4  # pixels read around a window so that interpolation sees its neighbours
 
@@ -134,7 +134,7 @@ def read_pixels(path, window=None):
             missing = file.read_masks(1, window=part) == 0
             if _has_mask_band(file):
                 missing |= file.read(2, window=part) == 0
-        except (*GDAL_ERRORS, ValueError) as error:
+        except GDAL_ERRORS as error:
             raise InputError(f"{path} cannot be read, it may be truncated: {error}") from error
         scale, offset = file.scales[0], file.offsets[0]
     values = np.clip(values, -SPECIAL, SPECIAL, dtype=np.float32)
@@ -277,7 +277,7 @@ def read_preview(path, size, body=MOON):
                 resampling=Resampling.average,
                 masked=True,
             ).filled(np.nan)
-        except (*GDAL_ERRORS, ValueError) as error:
+        except GDAL_ERRORS as error:
             raise InputError(f"{path} cannot be read, it may be truncated: {error}") from error
         unit = file.units[0] or ""
     rows, cols = grid.shape
@@ -301,47 +301,50 @@ def write_raster(path, values, grid, description, unit="", nodata=np.nan, valid=
         For 8-bit values, which have no NaN: stored as a mask in a second band.
     """
     path = Path(path)
-    values = np.asarray(values)
-    if values.dtype.kind == "f":
-        values = values.astype(np.float32)
-    else:
-        nodata = None
-    profile = {
-        "driver": "GTiff",
-        "height": grid.shape[0],
-        "width": grid.shape[1],
-        "count": 1 if valid is None else 2,
-        "dtype": values.dtype,
-        "crs": grid.crs.to_wkt(),
-        "transform": grid.affine,
-        "nodata": nodata,
-    }
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         with rasterio.MemoryFile() as memory:
-            with memory.open(**profile) as file:
-                file.write(values, 1)
-                file.set_band_description(1, description)
-                file.set_band_unit(1, unit)
-                if valid is not None:
-                    file.write(np.where(valid, 255, 0).astype(values.dtype), 2)
-                    file.set_band_description(2, "mask")
-            with memory.open() as file:
-                rasterio.shutil.copy(
-                    file,
-                    partial,
-                    driver="COG",
-                    compress="deflate",
-                    predictor="yes",
-                    overview_resampling="average",
-                    num_threads=2,
-                )
+            _write_cog(memory.name, np.asarray(values), grid, (description, unit), nodata, valid)
+            # not by GDAL, which says nothing when the disk is full
+            partial.write_bytes(memory.getbuffer())
         os.replace(partial, path)
     except GDAL_ERRORS as error:
         raise InputError(f"{path} cannot be written: {error}") from error
     finally:
         with suppress(OSError):
             partial.unlink()
+
+
+def _write_cog(path, values, grid, texts, nodata, valid):
+    is_float = values.dtype.kind == "f"
+    profile = {
+        "driver": "GTiff",
+        "height": grid.shape[0],
+        "width": grid.shape[1],
+        "count": 1 if valid is None else 2,
+        "dtype": np.float32 if is_float else values.dtype,
+        "crs": grid.crs.to_wkt(),
+        "transform": grid.affine,
+        "nodata": nodata if is_float else None,
+    }
+    with rasterio.MemoryFile() as memory:
+        with memory.open(**profile) as file:
+            file.write(values.astype(profile["dtype"], copy=False), 1)
+            file.set_band_description(1, texts[0])
+            file.set_band_unit(1, texts[1])
+            if valid is not None:
+                file.write(np.where(valid, 255, 0).astype(profile["dtype"]), 2)
+                file.set_band_description(2, "mask")
+        with memory.open() as file:
+            rasterio.shutil.copy(
+                file,
+                path,
+                driver="COG",
+                compress="deflate",
+                predictor="yes",
+                overview_resampling="average",
+                num_threads=2,
+            )
 
 
 def _open(path):
@@ -364,7 +367,13 @@ def _grid_of(file, path, body):
     is_usable = np.isfinite(file.transform).all() and not file.transform.is_degenerate
     if file.crs is None or file.transform.is_identity or not is_usable:
         return None
-    return Grid(file.shape, file.transform, read_crs(file.crs.to_wkt(), body, str(path)), body)
+    grid = Grid(file.shape, file.transform, read_crs(file.crs.to_wkt(), body, str(path)), body)
+    if not min(grid.spacing) >= LEAST_SPACING:
+        raise InputError(
+            f"{path}: pixels of {grid.spacing[0]:g} x {grid.spacing[1]:g} m are not those of a "
+            "map. Correct its CRS or transform with gdal_edit.py -a_srs and -a_ullr."
+        )
+    return grid
 
 
 def _needed_part(source, grid):

@@ -191,6 +191,7 @@ class Grid:
         there = there[:, np.isfinite(there).all(axis=0)]
         if there.size == 0:
             return Window(0, 0, 0, 0)
+        there = np.clip(there, -1, np.array(other.shape)[:, None] + 1)  # far away may overflow
         first = np.floor(there.min(axis=1)).astype(int)
         size = np.ceil(there.max(axis=1)).astype(int) - first + 1
         return Window(*first.tolist(), *size.tolist()).intersection(other.window)
