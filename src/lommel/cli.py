@@ -6,12 +6,12 @@ done, 1: a stage failed, 2: the request was wrong. Stages are imported when they
 """
 
 import json
+import signal
 import sys
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
-import click
 import typer
 from rich.console import Console
 from rich.markup import escape
@@ -259,13 +259,9 @@ def _root(
 
 def main():
     """Run the command line and turn errors into messages and exit status."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that half a run is cleared away
     try:
-        app(standalone_mode=False)
-    except click.exceptions.Abort:
-        sys.exit(130)
-    except click.ClickException as error:
-        error.show()
-        sys.exit(2)
+        app()
     except InputError as error:
         log.print(f"[bold red]error[/] {escape(str(error))}", soft_wrap=True)
         sys.exit(2)
