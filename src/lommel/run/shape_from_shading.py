@@ -23,6 +23,7 @@ from lommel.scene.masks import MaskSettings, shadow_thresholds
 from lommel.scene.view import OrthoView
 
 PARAMETRISATIONS = ("height", "ray")
+LEAST_POSTS = 33  # rows and columns: three octaves of wavelengths
 LEAST_LIT = 0.01  # share of an image's pixels that must be lit and unclipped for it to be used
 
 
@@ -84,9 +85,11 @@ def run_shape_from_shading(
             scene = read_scene(files, grid_settings, prefer="dem", progress=progress)
             observations, skipped = mask_observations(scene.observations, settings.masks)
             record.add_inputs([*files.images, *files.dems])
+            record.add_inputs([files.sun_positions, files.spacecraft_positions])
             record.add_skipped([*scene.skipped, *skipped])
             if not observations:
                 raise InputError("No image can be used.\n" + "\n".join(s.reason for s in skipped))
+            _refuse_small(scene.grid)
         with record.stage("solve"):
             known = np.isfinite(scene.heights)
             initial = fill_holes(scene.heights)
@@ -138,6 +141,15 @@ def mask_observations(observations, settings):
             continue
         usable.append(replace(observation, measured=np.where(is_used, measured, np.nan)))
     return usable, skipped
+
+
+def _refuse_small(grid):
+    rows, cols = grid.shape
+    if min(rows, cols) < LEAST_POSTS:
+        raise InputError(
+            f"DEM and images share {rows} x {cols} posts, {LEAST_POSTS} along each side are "
+            "needed to tell terrain from noise. Give a smaller --spacing or wider --bounds."
+        )
 
 
 def _surface(grid, heights, first, parametrisation):
