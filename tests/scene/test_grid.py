@@ -105,10 +105,13 @@ def test_cut_keeps_the_posts_in_place():
 def test_footprint_of_a_part_in_its_grid_is_that_part(name):
     grid = GRIDS[name]
     part = Window(5, 8, 12, 9)
-    footprint = grid.cut(part).footprint(grid)
-    assert part.intersection(footprint) == part
-    assert footprint.rows - part.rows <= 2  # posts of the neighbours that the edges touch
-    assert footprint.cols - part.cols <= 2
+    assert grid.cut(part).footprint(grid) == part
+
+
+def test_footprint_holds_the_posts_whose_pixels_are_touched():
+    grid = GRIDS["cylindrical"]
+    small = grid_from_bounds((30_600.0, 60_100.0, 31_400.0, 60_900.0), 100.0, CYLINDRICAL)
+    assert small.footprint(grid) == Window(18, 1, 2, 2)
 
 
 def test_footprint_of_a_grid_elsewhere_is_empty():

@@ -17,6 +17,7 @@ from lommel.scene.body import MOON
 from lommel.scene.geometry import Observation
 from lommel.scene.grid import Grid, Window, bounds_in, grid_from_bounds, read_crs
 
+POST_LIMIT = 2**30  # posts of the products: 4 GiB for every float32 array of them
 DEM_IS_FINE_ENOUGH = 1.5  # image pixels per DEM post up to which the DEM's own grid is kept
 
 
@@ -113,6 +114,9 @@ def read_scene(files, grid_settings=None, prefer="images", body=MOON, progress=i
     scene : Scene
     """
     _refuse_duplicates(files.images)
+    if not files.dems:
+        raise InputError("No DEM given. Name at least one with --dem.")
+    tables = _read_tables(files, body)
     dem_grids = [read_grid(path, body) for path in files.dems]
     image_grids, skipped = _place_images(files.images, dem_grids, body)
     if not image_grids:
@@ -120,8 +124,8 @@ def read_scene(files, grid_settings=None, prefer="images", body=MOON, progress=i
     grid = choose_grid(
         list(image_grids.values()), dem_grids, grid_settings or GridSettings(), prefer, body
     )
+    _refuse_huge(grid)
     heights = read_heights(files.dems, grid, body)
-    tables = _read_tables(files, body)
     observations = []
     for path in progress(list(image_grids)):
         try:
@@ -160,9 +164,15 @@ def choose_grid(image_grids, dem_grids, settings, prefer="images", body=MOON):
         own = dem_grids[0] if keeps_dem else image_grids[0]
         others = image_grids if keeps_dem else dem_grids
         return own.cut(_enclosing([grid.footprint(own) for grid in others]))
-    spacing = settings.spacing or (dem_spacing if keeps_dem else gsd)
-    bounds = settings.bounds or _shared_bounds(image_grids, dem_grids, crs)
-    return grid_from_bounds(bounds, spacing, crs, body)
+    spacing = settings.spacing
+    if spacing is None:
+        spacing = dem_spacing if keeps_dem else gsd
+    if settings.bounds is not None:
+        return grid_from_bounds(settings.bounds, spacing, crs, body)
+    bounds = np.array([bounds_in(grid, crs) for grid in image_grids])
+    union = *bounds[:, :2].min(axis=0).tolist(), *bounds[:, 2:].max(axis=0).tolist()
+    own = grid_from_bounds(union, spacing, crs, body)
+    return own.cut(_enclosing([dem.footprint(own) for dem in dem_grids]))
 
 
 def read_heights(paths, grid, body=MOON):
@@ -247,18 +257,19 @@ def _refuse_duplicates(paths):
         )
 
 
-def _shared_bounds(image_grids, dem_grids, crs):
-    def union(grids):
-        bounds = np.array([bounds_in(grid, crs) for grid in grids])
-        return np.concatenate([bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)])
-
-    images, dems = union(image_grids), union(dem_grids)
-    low, high = np.maximum(images[:2], dems[:2]), np.minimum(images[2:], dems[2:])
-    return (*low.tolist(), *high.tolist())
+def _refuse_huge(grid):
+    rows, cols = grid.shape
+    if rows * cols > POST_LIMIT:
+        raise InputError(
+            f"The products would have {rows} x {cols} posts, more than {POST_LIMIT}. "
+            "Give a larger --spacing or narrower --bounds."
+        )
 
 
 def _enclosing(windows):
     windows = [window for window in windows if not window.is_empty]
+    if not windows:
+        raise InputError("Images and DEM share no area in the CRS of the products. Check --crs.")
     row = min(window.row for window in windows)
     col = min(window.col for window in windows)
     last_row = max(window.row + window.rows for window in windows)
@@ -267,6 +278,6 @@ def _enclosing(windows):
 
 
 def _listing(skipped):
-    lines = [f"  {skip.name}: {skip.reason}" for skip in skipped[:20]]
+    lines = [f"  {skip.reason}" for skip in skipped[:20]]
     more = [f"  ... and {len(skipped) - 20} more"] if len(skipped) > 20 else []
     return "\n".join(lines + more)

@@ -192,8 +192,8 @@ class Grid:
         if there.size == 0:
             return Window(0, 0, 0, 0)
         there = np.clip(there, -1, np.array(other.shape)[:, None] + 1)  # far away may overflow
-        first = np.floor(there.min(axis=1)).astype(int)
-        size = np.ceil(there.max(axis=1)).astype(int) - first + 1
+        first = np.floor(there.min(axis=1) + 0.5 + SAME_POST).astype(int)
+        size = np.ceil(there.max(axis=1) - 0.5 - SAME_POST).astype(int) - first + 1
         return Window(*first.tolist(), *size.tolist()).intersection(other.window)
 
     def is_same(self, other):
