@@ -117,7 +117,7 @@ def predict_image(measured, modelled, haze_error, steps=30):
     for _ in range(steps):
         predicted = exposure * modelled + haze
         relative = (measured - predicted) / np.maximum(predicted, 0.05 * level)
-        scale = nmad(relative)
+        scale = max(nmad(relative), 1e-12)
         weight = 1.0 / (1.0 + (relative / (2.385 * scale)) ** 2)
         weight /= (scale * np.maximum(predicted, 0.05 * level)) ** 2
         columns = np.stack([modelled, np.ones_like(modelled)], axis=1)

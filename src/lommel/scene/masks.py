@@ -10,7 +10,7 @@ import numpy as np
 CLIPPED = 0.98  # of the saturation value; interpolation lowers clipped pixels by this much
 HISTOGRAM_BINS = 40  # from black to the brightness of lit ground
 VALLEY_LIMIT = 0.35  # of the lit brightness: shadow ends below it, even on ground facing away
-LEAST_SHADOW = 1e-4  # share of the pixels that the peak of a shadow's histogram must hold
+LEAST_SHADOW = 3e-4  # share of the pixels that the peak of a shadow's histogram must hold
 DARK_IMAGE = 0.25  # of the median image: an image darker than that is judged by the others' level
 
 
