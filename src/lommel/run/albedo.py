@@ -133,12 +133,13 @@ def _results(scene, result):
     suns = [o.sun_position for o, is_used in zip(scene.observations, used, strict=True) if is_used]
     slope = slope_towards_sun(scene.grid, scene.heights, suns)
     correlation, _ = shading_in_albedo(result.albedo, slope)
-    error = result.albedo_error / result.albedo
+    known = np.isfinite(result.albedo_error)
+    error = result.albedo_error[known] / result.albedo[known]
     return {
         "images": int(np.sum(used)),
         "disagreement_before_percent": 100.0 * result.disagreement_before,
         "disagreement_after_percent": 100.0 * result.disagreement,
-        "albedo_error_percent": 100.0 * float(np.nanmedian(error)),
+        "albedo_error_percent": 100.0 * float(np.median(error)) if known.any() else np.nan,
         "brightness_ramp_percent": 100.0 * np.expm1(brightness_ramp(result.albedo, result.count)),
         "shading_correlation": correlation,
         "noise_percent": 100.0 * result.noise,
