@@ -6,6 +6,7 @@ done, 1: a stage failed, 2: the request was wrong. Stages are imported when they
 """
 
 import json
+import math
 import signal
 import sys
 from contextlib import contextmanager
@@ -29,7 +30,7 @@ app = typer.Typer(
 log = Console(stderr=True, highlight=False, emoji=False)
 
 Images = Annotated[
-    list[Path], typer.Argument(help="Orthoimages: any raster GDAL reads that has a CRS.")
+    list[Path], typer.Argument(help="Rasters GDAL reads: with a CRS, or (sfs) with a camera.")
 ]
 Dems = Annotated[
     list[Path],
@@ -40,6 +41,13 @@ SunTable = Annotated[
 ]
 CraftTable = Annotated[
     Path | None, typer.Option(help="Table of lines KEY x y z: the camera, body-fixed, km or m.")
+]
+Cameras = Annotated[
+    list[Path] | None,
+    typer.Option(
+        help="Camera file (.tsai) of each image, in the same order; repeat. Default: the file "
+        "beside the image; without one the image is an orthoimage."
+    ),
 ]
 Unit = Annotated[str, typer.Option(help="Unit of the tables: auto, m or km.")]
 Output = Annotated[Path, typer.Option(help="Folder for the products; made when all is done.")]
@@ -131,6 +139,7 @@ def sfs(
     output: Output,
     sun_positions: SunTable = None,
     spacecraft_positions: CraftTable = None,
+    cameras: Cameras = None,
     positions_unit: Unit = "auto",
     parametrisation: Annotated[
         str,
@@ -138,6 +147,24 @@ def sfs(
             help="height: along the local vertical; ray: along the first image's view rays."
         ),
     ] = "height",
+    terrain_roughness: Annotated[
+        float | None,
+        typer.Option(
+            help="Change of slope from post to post, degrees rms. Default: from the images."
+        ),
+    ] = None,
+    initial_dem_error: Annotated[
+        float | None,
+        typer.Option(
+            help="Standard error of the DEM over its resolution, metres. Default: from the images."
+        ),
+    ] = None,
+    initial_dem_resolution: Annotated[
+        float | None,
+        typer.Option(
+            help="Length down to which the DEM can be trusted, metres. Default: from the images."
+        ),
+    ] = None,
     estimate_exposure: Annotated[
         bool, typer.Option(help="Re-estimate the exposures with the surface.")
     ] = True,
@@ -153,6 +180,7 @@ def sfs(
     overwrite: Overwrite = False,
 ):
     """Refine a DEM by shape from shading (photoclinometry) in one or more images."""
+    from lommel.estimate.priors import PriorSettings
     from lommel.estimate.shape_from_shading import SolverSettings
     from lommel.run.shape_from_shading import SfsSettings, run_shape_from_shading
     from lommel.scene.masks import MaskSettings
@@ -160,6 +188,11 @@ def sfs(
     settings = SfsSettings(
         parametrisation=parametrisation,
         reflectance=reflectance,
+        priors=PriorSettings(
+            None if terrain_roughness is None else math.radians(terrain_roughness),
+            initial_dem_error,
+            initial_dem_resolution,
+        ),
         solver=SolverSettings(
             max_steps=max_steps,
             estimate_exposure=estimate_exposure,
@@ -167,7 +200,7 @@ def sfs(
         ),
         masks=MaskSettings(shadow_threshold=shadow_threshold),
     )
-    files = _files(images, dem, sun_positions, spacecraft_positions, positions_unit)
+    files = _files(images, dem, sun_positions, spacecraft_positions, positions_unit, cameras)
     grid = _grid(spacing, crs, bounds)
     with _progress("Reading images") as progress:
         run_shape_from_shading(files, output, settings, grid, overwrite, progress)
@@ -270,10 +303,12 @@ def main():
         sys.exit(1)
 
 
-def _files(images, dems, sun_positions, spacecraft_positions, unit):
+def _files(images, dems, sun_positions, spacecraft_positions, unit, cameras=None):
     from lommel.run.inputs import SceneFiles
 
-    return SceneFiles(tuple(images), tuple(dems), sun_positions, spacecraft_positions, unit)
+    return SceneFiles(
+        tuple(images), tuple(dems), sun_positions, spacecraft_positions, unit, tuple(cameras or ())
+    )
 
 
 def _grid(spacing, crs, bounds):

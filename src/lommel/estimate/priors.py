@@ -13,9 +13,11 @@ on the image itself gives the spectrum of the terrain, hence its roughness. Esti
 images are combined by their median. Most callers want `estimate_priors`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+
+from lommel.errors import InputError
 
 TILE = 1024  # cells along each side of the part that is analysed
 FIT_STEPS = 30  # of the multiplicative update; 10 settle it to 1 %
@@ -60,6 +62,59 @@ class Priors:
     dem_errors: np.ndarray
     smoothing: float
     albedo_error: float = 0.0
+
+
+@dataclass(frozen=True)
+class PriorSettings:
+    """What is known better than the images tell; None is estimated from them.
+
+    Attributes
+    ----------
+    terrain_roughness : float, rad, or None
+        Standard deviation of the change of slope from post to post.
+    initial_dem_error : float, m, or None
+        Standard error of the initial DEM, averaged over its resolution.
+    initial_dem_resolution : float, m, or None
+        Length down to which the initial DEM can be trusted.
+    """
+
+    terrain_roughness: float | None = None
+    initial_dem_error: float | None = None
+    initial_dem_resolution: float | None = None
+
+    def __post_init__(self):
+        """Refuse what cannot be."""
+        for name, value in vars(self).items():
+            if value is not None and not 0 < value < np.inf:
+                raise InputError(f"{name} = {value} is not positive. Give a positive number.")
+
+    def applied_to(self, priors, spacing):
+        """Priors with the settings in place of the estimates.
+
+        Parameters
+        ----------
+        priors : Priors
+        spacing : float, m
+
+        Returns
+        -------
+        priors : Priors
+        """
+        if self.terrain_roughness is not None:
+            priors = replace(priors, roughness=self.terrain_roughness)
+        if self.initial_dem_error is None and self.initial_dem_resolution is None:
+            return priors
+        known = np.flatnonzero(np.isfinite(priors.dem_errors))
+        level = int(known[0]) if known.size else priors.dem_errors.size - 1
+        if self.initial_dem_resolution is not None:
+            level = max(int(round(np.log2(self.initial_dem_resolution / spacing))), 0)
+        error = self.initial_dem_error
+        if error is None:  # what the estimate holds at that length and longer ones, together
+            held = (priors.dem_errors**-2.0 / 4.0 ** np.arange(priors.dem_errors.size)).sum()
+            error = (max(held, 1e-12) * 4.0**level) ** -0.5
+        errors = np.full(level + 1, np.inf)
+        errors[level] = error
+        return replace(priors, dem_errors=errors, smoothing=2.0**level / 2)
 
 
 @dataclass(frozen=True)

@@ -205,8 +205,7 @@ class Problem:
         lattice, at_nodes, frame, _, _ = self.geometry
         for view, cells in zip(self.views, self.cells, strict=True):
             planes = view.coordinates(self.surface, lattice, frame, at_nodes)
-            is_ortho = hasattr(view, "observation")
-            reference = self.initial if is_ortho else np.zeros((1, 1), np.float32)
+            reference = self.initial if view.is_projected else np.zeros((1, 1), np.float32)
             with threads_for(u.shape):
                 sample_cells(view.image, planes, lattice.step, u, reference, cells)
 

@@ -23,7 +23,7 @@ from lommel.core.least_squares import Solution
 from lommel.core.multigrid import NormalEquations, conjugate_gradients, dot
 from lommel.core.normal_operator import prolong_add
 from lommel.estimate.albedo_field import fit_albedo
-from lommel.estimate.priors import Priors, estimate_priors
+from lommel.estimate.priors import Priors, PriorSettings, estimate_priors
 from lommel.estimate.problem import best_exposures, fresh_problem
 
 COARSEST = 24  # posts along the shorter side of the coarsest level that sees the images
@@ -97,8 +97,8 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
         Unknowns of the initial DEM at the posts; no holes.
     views : list of OrthoView or CameraView
     model : ReflectanceModel
-    priors : Priors, optional
-        Estimated from images and initial DEM by default.
+    priors : Priors or PriorSettings, optional
+        Estimated from images and initial DEM where not given.
     settings : SolverSettings, optional
     albedo : float32 array (rows - 1, cols - 1), optional
         Known albedo on the cells; 1 by default.
@@ -113,7 +113,9 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
     finest.prepare_geometry(finest.initial)
     finest.sample_images(finest.initial)
     finest.exposures[:] = best_exposures(finest.assemble(finest.initial)[2], finest.exposures)
-    priors = priors or _estimate_priors(finest)
+    if not isinstance(priors, Priors):
+        spacing = (surface.grid.spacing[0] * surface.grid.spacing[1]) ** 0.5
+        priors = (priors or PriorSettings()).applied_to(_estimate_priors(finest), spacing)
     finest.expect(priors)
     started = [finest.predict(finest.initial, k) for k in range(len(views))]
     history: list[dict] = []

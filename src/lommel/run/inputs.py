@@ -54,6 +54,8 @@ class SceneFiles:
     sun_positions, spacecraft_positions : Path or None
         Position tables.
     positions_unit : {'auto', 'm', 'km'}
+    cameras : tuple of Path
+        One camera file per image, in the same order; empty to look beside the images.
     """
 
     images: tuple[Path, ...]
@@ -61,6 +63,7 @@ class SceneFiles:
     sun_positions: Path | None = None
     spacecraft_positions: Path | None = None
     positions_unit: str = "auto"
+    cameras: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -113,18 +116,18 @@ def read_scene(files, grid_settings=None, prefer="images", body=MOON, progress=i
     -------
     scene : Scene
     """
-    _refuse_duplicates(files.images)
+    refuse_duplicates(files.images)
     if not files.dems:
         raise InputError("No DEM given. Name at least one with --dem.")
     tables = _read_tables(files, body)
     dem_grids = [read_grid(path, body) for path in files.dems]
     image_grids, skipped = _place_images(files.images, dem_grids, body)
     if not image_grids:
-        raise InputError("No image can be used.\n" + _listing(skipped))
+        raise InputError("No image can be used.\n" + listing(skipped))
     grid = choose_grid(
         list(image_grids.values()), dem_grids, grid_settings or GridSettings(), prefer, body
     )
-    _refuse_huge(grid)
+    refuse_huge(grid)
     heights = read_heights(files.dems, grid, body)
     observations = []
     for path in progress(list(image_grids)):
@@ -133,7 +136,7 @@ def read_scene(files, grid_settings=None, prefer="images", body=MOON, progress=i
         except LommelError as error:
             skipped.append(Skipped(path.name, str(error)))
     if not observations:
-        raise InputError("No image can be used.\n" + _listing(skipped))
+        raise InputError("No image can be used.\n" + listing(skipped))
     return Scene(grid, heights, observations, skipped)
 
 
@@ -245,7 +248,8 @@ def _read_tables(files, body):
     return tables
 
 
-def _refuse_duplicates(paths):
+def refuse_duplicates(paths):
+    """Raise `InputError` unless there are images, each with a name of its own."""
     if not paths:
         raise InputError("No image given. Name at least one image file.")
     counts = Counter(path.name for path in paths)
@@ -257,7 +261,8 @@ def _refuse_duplicates(paths):
         )
 
 
-def _refuse_huge(grid):
+def refuse_huge(grid):
+    """Raise `InputError` when a grid has more posts than any machine holds."""
     rows, cols = grid.shape
     if rows * cols > POST_LIMIT:
         raise InputError(
@@ -277,7 +282,8 @@ def _enclosing(windows):
     return Window(row, col, last_row - row, last_col - col)
 
 
-def _listing(skipped):
+def listing(skipped):
+    """The reasons of skipped images, one per line, for a message."""
     lines = [f"  {skip.reason}" for skip in skipped[:20]]
     more = [f"  ... and {len(skipped) - 20} more"] if len(skipped) > 20 else []
     return "\n".join(lines + more)

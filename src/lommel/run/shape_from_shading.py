@@ -4,7 +4,7 @@ Most callers want `run_shape_from_shading`.
 """
 
 import csv
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 from affine import Affine
@@ -12,19 +12,19 @@ from affine import Affine
 from lommel.core.reflectance import reflectance_model
 from lommel.errors import InputError
 from lommel.estimate.holes import fill_holes
+from lommel.estimate.priors import PriorSettings
 from lommel.estimate.shape_from_shading import SolverSettings, solve_surface
 from lommel.estimate.surface import Surface
 from lommel.io.raster import write_raster
-from lommel.run.inputs import GridSettings, SceneFiles, Skipped, read_scene
+from lommel.run.inputs import GridSettings, SceneFiles
 from lommel.run.products import RunRecord, output_folder
+from lommel.run.views import read_views
 from lommel.scene.geometry import surface_normals, viewing_geometry
 from lommel.scene.grid import Grid
-from lommel.scene.masks import MaskSettings, shadow_thresholds
-from lommel.scene.view import OrthoView
+from lommel.scene.masks import MaskSettings
 
 PARAMETRISATIONS = ("height", "ray")
 LEAST_POSTS = 33  # rows and columns: three octaves of wavelengths
-LEAST_LIT = 0.01  # share of an image's pixels that must be lit and unclipped for it to be used
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,14 @@ class SfsSettings:
         Along the local vertical, or along the view rays of the first image.
     reflectance : str
         Name of a reflectance model.
+    priors : PriorSettings
     solver : SolverSettings
     masks : MaskSettings
     """
 
     parametrisation: str = "height"
     reflectance: str = "lunar-lambert"
+    priors: PriorSettings = field(default_factory=PriorSettings)
     solver: SolverSettings = field(default_factory=SolverSettings)
     masks: MaskSettings = field(default_factory=MaskSettings)
 
@@ -55,7 +57,7 @@ def run_shape_from_shading(
     overwrite: bool = False,
     progress=iter,
 ):
-    """Refine a DEM by the shading in orthoimages and write the products.
+    """Refine a DEM by the shading in images and write the products.
 
     Parameters
     ----------
@@ -82,65 +84,31 @@ def run_shape_from_shading(
     record = RunRecord("sfs", asdict(settings) | {"grid": asdict(grid_settings or GridSettings())})
     with output_folder(output, overwrite) as folder:
         with record.stage("read"):
-            scene = read_scene(files, grid_settings, prefer="dem", progress=progress)
-            observations, skipped = mask_observations(scene.observations, settings.masks)
+            scene = read_views(files, grid_settings, settings.masks, progress=progress)
             record.add_inputs([*files.images, *files.dems])
-            record.add_inputs([files.sun_positions, files.spacecraft_positions])
-            record.add_skipped([*scene.skipped, *skipped])
-            if not observations:
-                raise InputError("No image can be used.\n" + "\n".join(s.reason for s in skipped))
+            tables = (files.sun_positions, files.spacecraft_positions)
+            record.add_inputs([*files.cameras, *filter(None, tables)])
+            record.add_skipped(scene.skipped)
             _refuse_small(scene.grid)
         with record.stage("solve"):
             known = np.isfinite(scene.heights)
             initial = fill_holes(scene.heights)
-            surface = _surface(scene.grid, initial, observations[0], settings.parametrisation)
+            surface = _surface(scene.grid, initial, scene.views[0], settings.parametrisation)
             start = surface.posts_from_heights(initial)
-            views = [OrthoView(observation) for observation in observations]
-            solution = solve_surface(surface, start, views, model, settings=settings.solver)
+            solution = solve_surface(
+                surface, start, scene.views, model, settings.priors, settings.solver
+            )
         with record.stage("write"):
             refined = surface.heights_from_posts(solution.value.u)
             seen = _seen_posts(solution.value.measured)
             refined[~(known | seen)] = np.nan
-            _write_products(folder, scene, initial, refined, observations[0], solution.value)
-            _write_exposures(folder, observations, record.skipped, solution.value)
+            _write_products(folder, scene, initial, refined, solution.value)
+            _write_exposures(folder, scene.views, record.skipped, solution.value)
         record.results = _results(scene, refined, solution.value)
         record.history = solution.history
         record.outcome = {"name": solution.outcome, "sentence": solution.advice}
         record.write(folder)
     return record.results
-
-
-def mask_observations(observations, settings):
-    """Blank shadow and clipped pixels; an image that keeps too little is left out.
-
-    Parameters
-    ----------
-    observations : list of Observation
-    settings : MaskSettings
-
-    Returns
-    -------
-    usable : list of Observation
-    skipped : list of Skipped
-    """
-    usable, skipped = [], []
-    images = [observation.measured for observation in observations]
-    thresholds = shadow_thresholds(images, settings)
-    for observation, threshold in zip(observations, thresholds, strict=True):
-        measured = observation.measured
-        is_used = (measured > threshold) & (measured < observation.saturation)
-        if is_used.mean() < LEAST_LIT:
-            skipped.append(
-                Skipped(
-                    observation.name,
-                    f"{observation.name} has {100 * is_used.mean():.2g} % of its pixels between "
-                    f"the shadow threshold {threshold:.4g} and saturation; {100 * LEAST_LIT:g} % "
-                    "are needed. Give a lit image, or a lower --shadow-threshold.",
-                )
-            )
-            continue
-        usable.append(replace(observation, measured=np.where(is_used, measured, np.nan)))
-    return usable, skipped
 
 
 def _refuse_small(grid):
@@ -153,7 +121,7 @@ def _refuse_small(grid):
 
 
 def _surface(grid, heights, first, parametrisation):
-    camera = first.spacecraft_position if parametrisation == "ray" else None
+    camera = first.position if parametrisation == "ray" else None
     return Surface(grid, float(np.mean(heights, dtype=float)), camera)
 
 
@@ -164,13 +132,13 @@ def _seen_posts(images):
     return padded[1:, 1:] & padded[1:, :-1] & padded[:-1, 1:] & padded[:-1, :-1]
 
 
-def _write_products(folder, scene, initial, refined, first, surface):
+def _write_products(folder, scene, initial, refined, surface):
     grid = scene.grid
     cells = cell_grid(grid)
     write_raster(folder / "dem.tif", refined, grid, "height", "m")
     write_raster(folder / "initial-dem.tif", scene.heights, grid, "height", "m")
     for name, heights in (("before", initial), ("after", refined)):
-        shade = hillshade(grid, heights, first)
+        shade = hillshade(grid, heights, scene.views[0])
         write_raster(folder / f"hillshade-{name}.tif", shade, grid, "cosine of incidence", "1")
     write_raster(folder / "measured.tif", surface.measured[0], cells, "measured brightness")
     modelled = np.where(np.isfinite(surface.measured[0]), surface.modelled[0], np.nan)
@@ -186,23 +154,21 @@ def cell_grid(grid):
     return Grid((grid.shape[0] - 1, grid.shape[1] - 1), affine, grid.crs, grid.body)
 
 
-def hillshade(grid, heights, observation):
+def hillshade(grid, heights, view):
     """Cosine of incidence under an image's own Sun, 0 where turned away.
 
     Parameters
     ----------
     grid : Grid
     heights : array (rows, cols), m
-    observation : Observation
+    view : OrthoView or CameraView
 
     Returns
     -------
     shade : array (rows, cols), dimensionless
     """
     xyz = grid.xyz(heights)
-    geometry = viewing_geometry(
-        xyz, surface_normals(xyz), observation.sun_position, observation.spacecraft_position
-    )
+    geometry = viewing_geometry(xyz, surface_normals(xyz), view.sun_position, view.position)
     return np.clip(geometry.cos_incidence, 0.0, None)
 
 
@@ -232,13 +198,13 @@ def correlation(measured, modelled):
     return float(np.corrcoef(measured[both], modelled[both])[0, 1])
 
 
-def _write_exposures(folder, observations, skipped, surface):
+def _write_exposures(folder, views, skipped, surface):
     with open(folder / "exposures.csv", "w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["image", "exposure", "haze", "used", "reason"])
-        for k, observation in enumerate(observations):
+        for k, view in enumerate(views):
             exposure, haze = float(surface.exposures[k]), float(surface.hazes[k])
-            writer.writerow([observation.name, exposure, haze, 1, ""])
+            writer.writerow([view.name, exposure, haze, 1, ""])
         for skip in skipped:
             writer.writerow([skip["image"], "", "", 0, skip["reason"]])
 

@@ -136,3 +136,38 @@ def nadir_rotation(position, heading):
     down = -unit(np.asarray(position, float))
     along = unit(heading - np.dot(heading, down) * down)
     return np.stack([along, np.cross(down, along), down])
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedCamera(Camera):
+    """The camera of an image whose pixels were averaged in squares.
+
+    Attributes
+    ----------
+    full : Camera
+        Of the image as it was.
+    factor : int
+        Pixels along each side of a square.
+    """
+
+    full: Camera
+    factor: int
+
+    @property
+    def position(self):
+        """Perspective centre, body-fixed, m."""
+        return self.full.position
+
+    @property
+    def shape(self):
+        """Lines and samples of the reduced image."""
+        return self.full.shape[0] // self.factor, self.full.shape[1] // self.factor
+
+    def project(self, xyz):
+        """Image coordinates of ground points; see `Camera.project`."""
+        line, sample = self.full.project(xyz)
+        return line / self.factor, sample / self.factor
+
+    def ray(self, line, sample):
+        """Directions in which pixels look; see `Camera.ray`."""
+        return self.full.ray(line * self.factor, sample * self.factor)

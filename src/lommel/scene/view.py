@@ -5,7 +5,7 @@ surface's unknown: array line and sample at ``u = 0``, and their change per metr
 want `OrthoView` and `CameraView`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +27,15 @@ class OrthoView:
     """
 
     observation: Observation
+
+    @property
+    def is_projected(self):
+        """True: the image was made with a terrain."""
+        return True
+
+    def with_image(self, image):
+        """The same view with other pixel values."""
+        return OrthoView(replace(self.observation, measured=image))
 
     @property
     def name(self):
@@ -87,6 +96,15 @@ class CameraView:
     image: np.ndarray
     camera: Camera
     sun_position: np.ndarray
+
+    @property
+    def is_projected(self):
+        """False: the image is as the camera took it."""
+        return False
+
+    def with_image(self, image):
+        """The same view with other pixel values."""
+        return replace(self, image=image)
 
     @property
     def position(self):

@@ -1,0 +1,218 @@
+"""What `lommel sfs` reads: one terrain and the images as they see it.
+
+An image with a camera (named, or in a file beside it) is used as it was taken; one without is an
+orthoimage. Most callers want `read_views`.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lommel.errors import GeometryError, InputError, LommelError
+from lommel.io.cameras import find_camera, read_camera
+from lommel.io.positions import find_position, read_positions
+from lommel.io.raster import raster_info, read_grid, read_pixels
+from lommel.run.inputs import (
+    DEM_IS_FINE_ENOUGH,
+    GridSettings,
+    Skipped,
+    listing,
+    read_heights,
+    read_scene,
+    refuse_duplicates,
+    refuse_huge,
+)
+from lommel.scene.body import MOON
+from lommel.scene.camera import ReducedCamera
+from lommel.scene.grid import Grid, bounds_in, grid_from_bounds, read_crs
+from lommel.scene.masks import MaskSettings, shadow_thresholds
+from lommel.scene.view import CameraView, OrthoView
+
+LEAST_LIT = 0.01  # share of an image's pixels that must be lit and unclipped for it to be used
+
+
+@dataclass(frozen=True)
+class ViewedTerrain:
+    """Terrain and the images that see it.
+
+    Attributes
+    ----------
+    grid : Grid
+    heights : float32 array (rows, cols), m
+        NaN in holes.
+    views : list of OrthoView or CameraView
+        Shadow and clipped pixels are NaN.
+    skipped : list of Skipped
+    """
+
+    grid: Grid
+    heights: np.ndarray
+    views: list
+    skipped: list[Skipped]
+
+
+def read_views(files, grid_settings=None, masks=None, body=MOON, progress=iter):
+    """Terrain and images for shape from shading.
+
+    Parameters
+    ----------
+    files : SceneFiles
+    grid_settings : GridSettings, optional
+    masks : MaskSettings, optional
+    body : Body
+    progress : callable
+        Wraps the iterable of images, as ``rich.progress.track`` does.
+
+    Returns
+    -------
+    terrain : ViewedTerrain
+    """
+    refuse_duplicates(files.images)
+    grid_settings = grid_settings or GridSettings()
+    cameras = _camera_files(files)
+    flat = tuple(path for path in files.images if path not in cameras)
+    views, skipped = [], []
+    if flat:
+        scene = read_scene(replace(files, images=flat), grid_settings, "dem", body, progress)
+        grid, heights, skipped = scene.grid, scene.heights, list(scene.skipped)
+        views = [(OrthoView(o), o.saturation) for o in scene.observations]
+    else:
+        grid = _terrain_grid(files.dems, cameras, grid_settings, body)
+        heights = read_heights(files.dems, grid, body)
+    suns = _sun_table(files, body) if cameras else {}
+    for path in progress(list(cameras)) if cameras else ():
+        try:
+            views.append(_camera_view(path, cameras[path], suns, files, grid, heights, body))
+        except LommelError as error:
+            skipped.append(Skipped(path.name, str(error)))
+    order = {path.name: number for number, path in enumerate(files.images)}
+    views.sort(key=lambda pair: order[pair[0].name])
+    usable, unusable = mask_views(views, masks or MaskSettings())
+    skipped += unusable
+    if not usable:
+        raise InputError("No image can be used.\n" + listing(skipped))
+    return ViewedTerrain(grid, heights, usable, skipped)
+
+
+def mask_views(views, settings):
+    """Blank shadow and clipped pixels; an image that keeps too little is left out.
+
+    Parameters
+    ----------
+    views : list of (OrthoView or CameraView, float)
+        Each with the value at which its image clips.
+    settings : MaskSettings
+
+    Returns
+    -------
+    usable : list of OrthoView or CameraView
+    skipped : list of Skipped
+    """
+    usable, skipped = [], []
+    thresholds = shadow_thresholds([view.image for view, _ in views], settings)
+    for (view, saturation), threshold in zip(views, thresholds, strict=True):
+        is_used = (view.image > threshold) & (view.image < saturation)
+        if is_used.mean() >= LEAST_LIT:
+            usable.append(view.with_image(np.where(is_used, view.image, np.float32(np.nan))))
+            continue
+        reason = (
+            f"{view.name} has {100 * is_used.mean():.2g} % of its pixels between the shadow "
+            f"threshold {threshold:.4g} and saturation; {100 * LEAST_LIT:g} % are needed. "
+            "Give a lit image, or a lower --shadow-threshold."
+        )
+        skipped.append(Skipped(view.name, reason))
+    return usable, skipped
+
+
+def _camera_files(files):
+    """Camera file of each image that has one."""
+    if files.cameras and len(files.cameras) != len(files.images):
+        raise InputError(
+            f"--cameras names {len(files.cameras)} files for {len(files.images)} images. "
+            "Name one per image, in the same order."
+        )
+    paths = files.cameras or [find_camera(path) for path in files.images]
+    return {image: path for image, path in zip(files.images, paths, strict=True) if path}
+
+
+def _terrain_grid(dems, cameras, settings, body):
+    """The DEM's own posts, unless told otherwise or coarser than the images."""
+    if not dems:
+        raise InputError("No DEM given. Name at least one with --dem.")
+    grids = [read_grid(path, body) for path in dems]
+    gsd = _least_gsd(cameras, grids[0])
+    dem_spacing = max(grids[0].spacing)
+    is_fine_enough = gsd is None or dem_spacing < DEM_IS_FINE_ENOUGH * gsd
+    if settings.is_automatic and len(grids) == 1 and is_fine_enough:
+        return grids[0]
+    crs = read_crs(settings.crs, body, "--crs") if settings.crs else grids[0].crs
+    bounds = np.array([bounds_in(grid, crs) for grid in grids])
+    union = *bounds[:, :2].min(axis=0).tolist(), *bounds[:, 2:].max(axis=0).tolist()
+    spacing = settings.spacing or (dem_spacing if is_fine_enough else gsd)
+    grid = grid_from_bounds(settings.bounds or union, spacing, crs, body)
+    refuse_huge(grid)
+    return grid
+
+
+def _least_gsd(cameras, grid):
+    """Median ground sample distance of the images at the DEM's centre; None when none sees it."""
+    found = []
+    for image, path in cameras.items():
+        try:
+            camera = read_camera(path, raster_info(image).shape)
+        except LommelError:
+            continue  # reported when the image is read
+        found.append(ground_sample_distance(camera, grid, 0.0))
+    found = [gsd for gsd in found if np.isfinite(gsd)]
+    return float(np.median(found)) if found else None
+
+
+def ground_sample_distance(camera, grid, height):
+    """Ground distance between pixels at the centre of a grid, m; NaN when out of view.
+
+    Parameters
+    ----------
+    camera : Camera
+    grid : Grid
+    height : float, m
+    """
+    middle = grid.cut(
+        replace(grid.window, row=grid.shape[0] // 2, col=grid.shape[1] // 2, rows=2, cols=2)
+    )
+    line, sample = camera.project(middle.xyz(height))
+    along_row = np.hypot(line[0, 1] - line[0, 0], sample[0, 1] - sample[0, 0])
+    along_col = np.hypot(line[1, 0] - line[0, 0], sample[1, 0] - sample[0, 0])
+    pixels = (along_row * along_col) ** 0.5
+    return (grid.spacing[0] * grid.spacing[1]) ** 0.5 / pixels if pixels > 0 else np.nan
+
+
+def _camera_view(path, camera_path, suns, files, grid, heights, body):
+    image = read_pixels(path)
+    camera = read_camera(camera_path, image.shape)
+    line, sample = camera.project(grid.xyz(float(np.nanmean(heights)))[::8, ::8])
+    if not camera.contains(line, sample).any():
+        raise GeometryError(
+            f"{path.name}: its camera does not see the DEM. Check that camera and DEM belong to "
+            "the same place, and the units of the camera file (metres)."
+        )
+    gsd = ground_sample_distance(camera, grid, float(np.nanmean(heights)))
+    factor = int(min(grid.spacing) / gsd + 0.5) if np.isfinite(gsd) else 1
+    if factor > 1:  # finer pixels than posts: their means are what the cells can explain
+        image, camera = _reduce(image, factor), ReducedCamera(camera, factor)
+    sun = find_position(suns, path.name, files.sun_positions)
+    return CameraView(path.name, image, camera, sun), raster_info(path, body).saturation
+
+
+def _reduce(image, factor):
+    lines, samples = (size // factor for size in image.shape)
+    squares = image[: lines * factor, : samples * factor].reshape(lines, factor, samples, factor)
+    return squares.mean(axis=(1, 3), dtype=np.float32)
+
+
+def _sun_table(files, body):
+    if files.sun_positions is None:
+        raise InputError(
+            "The camera files do not tell where the Sun stood. Name a table of lines KEY x y z "
+            "with --sun-positions."
+        )
+    return read_positions(files.sun_positions, "sun", body, files.positions_unit)
