@@ -134,7 +134,7 @@ def measured_against_modelled(contents):
     panels += _difference_panels(difference)
     residual = contents.preview("residual.tif")
     if residual is not None and contents.record["results"].get("images", 1) > 1:
-        title, label = "All images", f"rms residual, {residual.unit}"
+        title, label = "All images", "rms residual, % of the median"
         limits = (0.0, drawing.percent_clipped(residual.values)[1])
         panels.append(_map(residual, "residual", title, label, "cividis", limits, UNUSED))
     text = (

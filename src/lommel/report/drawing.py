@@ -43,6 +43,7 @@ STYLE = {
     "legend.frameon": False,
     "legend.fontsize": 8.0,
 }
+STEPS = [1, 2, 2.5, 5, 10]  # of the ticks
 DPI = 190  # a panel is then about twice as many pixels wide as it is shown
 PANEL_WIDTH = 4.8  # inches; two panels stand side by side
 FULL_WIDTH = 8.6  # inches; across the page
@@ -114,15 +115,15 @@ def draw_map(
             axes.imshow(paint, cmap=ListedColormap([SHADOW]), interpolation="nearest", **place)
         axes.set_title(title)
         axes.set(xlabel=names[0], ylabel=names[1])
-        axes.locator_params(nbins=8 if is_wide(grid) else 5, axis="x")
-        axes.locator_params(nbins=5, axis="y")
+        axes.locator_params(axis="x", nbins=8 if is_wide(grid) else 5, steps=STEPS)
+        axes.locator_params(axis="y", nbins=5, steps=STEPS)
         bar = figure.colorbar(
             image,
             cax=bar_axes,
             label=label,
             extend=_ends_beyond(values, limits),
             orientation="horizontal" if is_wide(grid) else "vertical",
-            ticks=MaxNLocator(6, integer=whole_numbers),
+            ticks=MaxNLocator(6, steps=STEPS, integer=whole_numbers),
         )
         bar.outline.set_visible(False)
         if handles:

@@ -62,7 +62,7 @@ class Quantity:
 
 
 def quantities_of(results, targets):
-    """Results in words, those with a unit first.
+    """Results in words: what changed first, then what has a unit, then the rest.
 
     A pair ``..._before`` and ``..._after`` becomes one line.
 
@@ -97,7 +97,7 @@ def quantities_of(results, targets):
         meaning = MEANINGS.get(stem, "")
         missed = is_missed(value, target)
         quantities.append(Quantity(in_words(stem), shown, unit, meaning, target, missed))
-    return sorted(quantities, key=lambda quantity: not quantity.unit)
+    return sorted(quantities, key=lambda quantity: ("→" not in quantity.value, not quantity.unit))
 
 
 def is_missed(value, target):
