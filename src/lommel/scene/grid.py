@@ -100,12 +100,13 @@ class Grid:
 
     @cached_property
     def spacing(self):
-        """Ground distance between posts at the grid's centre: along rows' and columns' index, m."""
+        """Distance between posts on the sphere at the grid's centre: along row and column, m."""
         middle = (np.array(self.shape) - 1) / 2
         rows = middle[0] + np.array([[-0.5, 0.0], [0.5, 0.0]])
         cols = middle[1] + np.array([[0.0, -0.5], [0.0, 0.5]])
         xyz = to_xyz(self.body, *self.lonlat_at(rows, cols), 0.0)
-        return tuple(float(d) for d in np.linalg.norm(xyz[1] - xyz[0], axis=-1))
+        chords = np.linalg.norm(xyz[1] - xyz[0], axis=-1)
+        return tuple((2 * self.body.radius * np.arcsin(chords / (2 * self.body.radius))).tolist())
 
     def cut(self, window):
         """The part of this grid inside a window, as a grid of its own."""
