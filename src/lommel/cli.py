@@ -177,6 +177,7 @@ def sfs(
     spacing: Spacing = None,
     crs: Crs = None,
     bounds: Bounds = None,
+    report: Annotated[bool, typer.Option(help="Also draw report.html (3 s).")] = False,
     overwrite: Overwrite = False,
 ):
     """Refine a DEM by shape from shading (photoclinometry) in one or more images."""
@@ -204,7 +205,7 @@ def sfs(
     grid = _grid(spacing, crs, bounds)
     with _progress("Reading images") as progress:
         run_shape_from_shading(files, output, settings, grid, overwrite, progress)
-    _finish(output)
+    _finish(output, report)
 
 
 @app.command()
@@ -330,11 +331,8 @@ def _progress(title):
         yield lambda items, description=title: bar.track(items, description=description)
 
 
-def _finish(output):
-    """Draw the report, print outcome and skipped images, and the paths of the products."""
-    from lommel.report import write_report
-
-    page = write_report(output)
+def _finish(output, draws_report=True):
+    """Print outcome, results and skipped images, and the paths of the products."""
     record = json.loads((output / "run.json").read_text(encoding="utf-8"))
     for skip in record["skipped"]:
         log.print(f"[yellow]left out[/] {escape(skip['reason'])}", soft_wrap=True)
@@ -345,4 +343,9 @@ def _finish(output):
         )
     for path in sorted(output.glob("*.tif")):
         typer.echo(path)
-    typer.echo(page)
+    if draws_report:
+        from lommel.report import write_report
+
+        typer.echo(write_report(output))
+    else:
+        log.print(f"lommel report {escape(str(output))} draws the figures.", soft_wrap=True)

@@ -7,6 +7,7 @@ orthoimage. Most callers want `read_views`.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import binary_erosion
 
 from lommel.errors import GeometryError, InputError, LommelError
 from lommel.io.cameras import find_camera, read_camera
@@ -25,9 +26,10 @@ from lommel.run.inputs import (
 from lommel.scene.body import MOON
 from lommel.scene.camera import ReducedCamera
 from lommel.scene.grid import Grid, bounds_in, grid_from_bounds, read_crs
-from lommel.scene.masks import MaskSettings, shadow_thresholds
+from lommel.scene.masks import CLIPPED, MaskSettings, shadow_thresholds
 from lommel.scene.view import CameraView, OrthoView
 
+MARGIN = 2  # pixels beside unusable ones that are left out: the reach of interpolation
 LEAST_LIT = 0.01  # share of an image's pixels that must be lit and unclipped for it to be used
 
 
@@ -111,7 +113,9 @@ def mask_views(views, settings):
     usable, skipped = [], []
     thresholds = shadow_thresholds([view.image for view, _ in views], settings)
     for (view, saturation), threshold in zip(views, thresholds, strict=True):
-        is_used = (view.image > threshold) & (view.image < saturation)
+        is_used = (view.image > threshold) & (view.image < CLIPPED * saturation)
+        # what lies beside shadow, clipping or no data holds part of it: read as slope, a scarp
+        is_used = binary_erosion(is_used, iterations=MARGIN, border_value=1)
         if is_used.mean() >= LEAST_LIT:
             usable.append(view.with_image(np.where(is_used, view.image, np.float32(np.nan))))
             continue
