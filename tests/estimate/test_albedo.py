@@ -89,7 +89,7 @@ def test_both_solvers_find_the_same_minimum(noisy):
     assert len(fast.history) < len(slow.history) / 5
 
 
-@pytest.mark.parametrize("settings", [published_settings(), AlbedoSettings()])
+@pytest.mark.parametrize("settings", [published_settings(), AlbedoSettings(tolerance=1e-9)])
 def test_cost_never_rises(noisy, settings):
     result = estimate_albedo(noisy.observations, noisy.grid, noisy.heights, settings)
     costs = [entry["cost"] for entry in result.history]

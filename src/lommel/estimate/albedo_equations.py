@@ -30,7 +30,9 @@ from lommel.estimate.albedo_kernels import accumulate
 from lommel.estimate.albedo_rows import LOSSES
 from lommel.estimate.albedo_settings import AlbedoSettings
 
-SHARED_ERROR = np.array([1.0, 1.0, 3.0, 3.0])  # prior standard error of c1, c2, v2, v4: loose
+# Prior standard errors of c1, c2, v2, v4. A strip under one Sun cannot tell phase from a trend of
+# albedo, so the lunar phase function is taken as known to a tenth; falloff is left loose.
+SHARED_ERROR = np.array([0.1, 0.05, 3.0, 3.0])
 PIN = 1e-9  # of the diagonal, added where the gauge would make the matrix singular
 
 
