@@ -295,7 +295,7 @@ def main():
     """Run the command line and turn errors into messages and exit status."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that half a run is cleared away
     try:
-        app()
+        app(prog_name="lommel")
     except InputError as error:
         log.print(f"[bold red]error[/] {escape(str(error))}", soft_wrap=True)
         sys.exit(2)

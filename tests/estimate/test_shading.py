@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lommel.core.normal_operator import slope_adjoint
-from lommel.core.reflectance import reflectance_model
+from lommel.core.reflectance import reflectance_model, user_model
 from lommel.estimate.shading_kernels import SUM_COUNT, SUM_FF, SUM_FM, sample_cells
 from lommel.scene.geometry import surface_normals, viewing_geometry
 
@@ -71,6 +71,18 @@ def test_modelled_image_is_exposure_times_reflectance_of_the_terrain():
     posts = (cells[1:, 1:] + cells[1:, :-1] + cells[:-1, 1:] + cells[:-1, :-1]) / 4
     # hills of 160 m correlation length: slopes over 20 and over 40 m differ by 1 % of the shading
     np.testing.assert_allclose(posts[3:-3, 3:-3], plain[4:-4, 4:-4], atol=0.01 * EXPOSURE)
+
+
+def lambert_of_a_user(cos_incidence, cos_emission, phase, gain=1.0):
+    """A user's own law, without compiled twin."""
+    return gain * cos_incidence, gain * np.ones_like(cos_incidence), np.zeros_like(cos_incidence)
+
+
+def test_law_of_a_user_gives_the_same_as_the_compiled_one():
+    compiled, u = moved_problem(model=reflectance_model("lambert"))
+    own, _ = moved_problem(model=user_model(lambert_of_a_user, "own"))
+    for mine, theirs in zip(own.assemble(u)[:3], compiled.assemble(u)[:3], strict=True):
+        np.testing.assert_allclose(mine, theirs, rtol=1e-4, atol=1e-3)
 
 
 def test_missing_cells_do_not_count():

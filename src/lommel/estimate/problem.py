@@ -17,6 +17,7 @@ from lommel.estimate.shading_kernels import (
     SUM_FF,
     SUM_FM,
     assemble,
+    cosines,
     eliminate_albedo,
     predict,
     sample_cells,
@@ -117,6 +118,7 @@ class Problem:
                     spacing,
                     self.model.kind,
                     parameters,
+                    self._law(u, k),
                     self.albedo,
                     self.cells[k],
                     image,
@@ -135,6 +137,16 @@ class Problem:
         tensors[2] += self.slope[1]
         return tensors, gradient, sums, best, albedo_cost
 
+    def _law(self, u, k):
+        """Reflectance and derivatives of a model without compiled twin; else a placeholder."""
+        if self.model.kind >= 0:
+            return np.zeros((3, 1, 1), np.float32)
+        lattice, _, _, gram, lights = self.geometry
+        planes = np.empty((4, u.shape[0] - 1, u.shape[1] - 1), np.float32)
+        spacing = np.array(self.surface.grid.spacing, np.float32) * self.stride
+        cosines(u, gram, lights[k], lattice.step, spacing, planes)
+        return np.stack(self.model.with_derivatives(*planes[:3])).astype(np.float32)
+
     def predict(self, u, k):
         """Modelled image ``k`` on the cells."""
         lattice, _, _, gram, lights = self.geometry
@@ -150,6 +162,7 @@ class Problem:
                 spacing,
                 self.model.kind,
                 self.model.parameter_array(),
+                self._law(u, k),
                 self.albedo,
                 image,
                 out,

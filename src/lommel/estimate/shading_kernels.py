@@ -165,8 +165,8 @@ def _cosine_row(p, q, terms, length, dp, dq, cosine, cosine_p, cosine_q):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _shade_row(r, u, gram, light, step, inverse_row, inverse_col, kind, parameters, work):
-    """Reflectance of one row of cells in work[0], its slope derivatives in work[1] and work[2]."""
+def _cosines_row(r, u, gram, light, step, inverse_row, inverse_col, work):
+    """Cosines of one row of cells, with derivatives, in work[16:22]; phase terms in work[14:16]."""
     p, q, length, dp, dq = work[3], work[4], work[5], work[6], work[7]
     row = (r + 0.5) / step
     _slopes_row(u[r], u[r + 1], inverse_row, inverse_col, p, q)
@@ -177,11 +177,22 @@ def _shade_row(r, u, gram, light, step, inverse_row, inverse_col, kind, paramete
         expand_row(light[k], row, step, work[8 + k])
     _cosine_row(p, q, work[8:11], length, dp, dq, work[16], work[17], work[18])
     _cosine_row(p, q, work[11:14], length, dp, dq, work[19], work[20], work[21])
-    reflectance_row(
-        kind, parameters, work[16], work[19], work[14], work[15], work[0], work[22], work[23]
-    )
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _shade_row(r, u, gram, light, step, inverse_row, inverse_col, kind, parameters, law, work):
+    """Reflectance of one row of cells in work[0], its slope derivatives in work[1] and work[2]."""
+    _cosines_row(r, u, gram, light, step, inverse_row, inverse_col, work)
+    if kind < 0:  # a law without compiled twin: evaluated on whole arrays beforehand
+        work[0] = law[0, r]
+        work[22] = law[1, r]
+        work[23] = law[2, r]
+    else:
+        reflectance_row(
+            kind, parameters, work[16], work[19], work[14], work[15], work[0], work[22], work[23]
+        )
     by_incidence, by_emission = work[22], work[23]
-    for c in range(p.size):
+    for c in range(u.shape[1] - 1):
         work[1, c] = by_incidence[c] * work[17, c] + by_emission[c] * work[20, c]
         work[2, c] = by_incidence[c] * work[18, c] + by_emission[c] * work[21, c]
 
@@ -248,6 +259,7 @@ def assemble(
     spacing,
     kind,
     parameters,
+    law,
     albedo,
     measured,
     image,
@@ -270,6 +282,9 @@ def assemble(
         Between rows and between columns.
     kind, parameters
         Of the reflectance model.
+    law : float32 array (3, rows - 1, cols - 1) or (3, 1, 1)
+        Reflectance and its derivatives for a model without compiled twin (kind -1), from
+        `cosines` and the model itself; any array of three dimensions otherwise.
     albedo, measured : float32 array (rows - 1, cols - 1)
         ``measured`` is NaN where the cell is not used.
     image : float32 array (4,)
@@ -295,7 +310,9 @@ def assemble(
         first = np.int64(block) * BLOCK
         work = np.empty((WORK_ROWS, cols), np.float32)
         for r in range(first, min(first + BLOCK, rows)):
-            _shade_row(r, u, gram, light, step, inverse_row, inverse_col, kind, parameters, work)
+            _shade_row(
+                r, u, gram, light, step, inverse_row, inverse_col, kind, parameters, law, work
+            )
             for c in range(cols):  # per difference of heights from here on
                 work[1, c] *= inverse_col
                 work[2, c] *= inverse_row
@@ -363,7 +380,7 @@ def eliminate_albedo(albedo, tensors, gradient, shared, precision, best):
 
 
 @njit(cache=True, parallel=True)
-def predict(u, gram, light, step, spacing, kind, parameters, albedo, image, out):
+def predict(u, gram, light, step, spacing, kind, parameters, law, albedo, image, out):
     """Write the modelled image on the cells; arguments as in `assemble`."""
     rows, cols = out.shape
     inverse_row, inverse_col = np.float32(1.0) / spacing[0], np.float32(1.0) / spacing[1]
@@ -371,6 +388,26 @@ def predict(u, gram, light, step, spacing, kind, parameters, albedo, image, out)
         first = np.int64(block) * BLOCK
         work = np.empty((WORK_ROWS, cols), np.float32)
         for r in range(first, min(first + BLOCK, rows)):
-            _shade_row(r, u, gram, light, step, inverse_row, inverse_col, kind, parameters, work)
+            _shade_row(
+                r, u, gram, light, step, inverse_row, inverse_col, kind, parameters, law, work
+            )
             for c in range(cols):
                 out[r, c] = image[0] * albedo[r, c] * work[0, c] + image[1]
+
+
+@njit(cache=True, parallel=True)
+def cosines(u, gram, light, step, spacing, out):
+    """Cosines of incidence and emission, phase share and factor: ``out`` (4, rows - 1, cols - 1).
+
+    For models without compiled twin, whose share is the phase itself. Other arguments as in
+    `assemble`.
+    """
+    rows, cols = out.shape[1:]
+    inverse_row, inverse_col = np.float32(1.0) / spacing[0], np.float32(1.0) / spacing[1]
+    for block in prange((rows + BLOCK - 1) // BLOCK):
+        first = np.int64(block) * BLOCK
+        work = np.empty((WORK_ROWS, cols), np.float32)
+        for r in range(first, min(first + BLOCK, rows)):
+            _cosines_row(r, u, gram, light, step, inverse_row, inverse_col, work)
+            out[0, r], out[1, r] = work[16], work[19]
+            out[2, r], out[3, r] = work[14], work[15]
