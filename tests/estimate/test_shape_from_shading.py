@@ -1,5 +1,7 @@
 """The solver: converges quadratically, finds the truth, in both parametrisations alike."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, zoom
@@ -184,3 +186,61 @@ def test_holes_are_filled_with_the_plane_around_them():
     assert np.isfinite(filled).all()
     np.testing.assert_array_equal(filled[:20], plane[:20])
     np.testing.assert_allclose(filled, plane, atol=0.5)  # m, 1 % of the hole's relief
+
+
+def test_odd_image_is_named():
+    """One of four images was taken under another Sun than its table says."""
+    truth, initial = rough_scene(size=96, seed=15)
+    grid = patch_grid(*truth.shape)
+    views = simulated_views(truth, grid, (40.0, 130.0, 220.0, 310.0))
+    views[2] = views[2].with_image(views[0].image)
+    solution = solve_surface(
+        Surface(grid, 0.0), initial, views, reflectance_model(), weak_priors(4)
+    )
+    assert solution.outcome == "contradiction"
+    assert views[2].name in solution.advice
+
+
+def test_wildly_wrong_dem_is_reported_and_stays_finite():
+    truth, _ = rough_scene(size=96, seed=16)
+    grid = patch_grid(*truth.shape)
+    views = simulated_views(truth, grid, (40.0, 160.0, 280.0))
+    wild = np.random.default_rng(17).normal(0, 500.0, truth.shape).astype(np.float32)
+    solution = solve_surface(Surface(grid, 0.0), wild, views, reflectance_model())
+    assert solution.outcome != "converged"
+    assert np.isfinite(solution.value.u).all()
+
+
+def test_albedo_and_slope_are_told_apart_by_different_suns_only():
+    truth, initial = rough_scene(size=64, seed=18)
+    grid = patch_grid(*truth.shape)
+    shares = []
+    for azimuths in ((100.0,), (100.0, 100.0), (100.0, 280.0)):
+        views = simulated_views(truth, grid, azimuths)
+        views = [
+            replace(view, observation=replace(view.observation, name=f"{k}.tif"))
+            for k, view in enumerate(views)
+        ]
+        solution = solve_surface(
+            Surface(grid, 0.0), initial, views, reflectance_model(), weak_priors(len(views))
+        )
+        shares.append(float(np.nanmedian(solution.value.separation)))
+    assert shares[0] < 1e-3 and shares[1] < 1e-3
+    assert shares[2] > 0.5
+
+
+def test_albedo_is_recovered_under_three_suns():
+    """A patchy albedo of 10 % rms neither spoils the terrain nor is spoiled by it."""
+    truth, initial = rough_scene(seed=19)
+    grid = patch_grid(*truth.shape)
+    patches = gaussian_filter(np.random.default_rng(20).normal(size=truth.shape), 6.0)
+    albedo = 1 + 0.1 * patches / patches.std()
+    views = [
+        view.with_image((view.image * albedo).astype(np.float32))
+        for view in simulated_views(truth, grid, (40.0, 160.0, 280.0))
+    ]
+    solution = solve_surface(Surface(grid, 0.0), initial, views, reflectance_model())
+    assert rms(solution.value.u - truth) < HEIGHT_SHARE * rms(initial - truth)
+    on_cells = (albedo[1:, 1:] + albedo[1:, :-1] + albedo[:-1, 1:] + albedo[:-1, :-1]) / 4
+    match = np.corrcoef(solution.value.albedo.ravel(), on_cells.ravel())[0, 1]
+    assert match > 0.98

@@ -77,7 +77,10 @@ class AlbedoResult:
         Standard error of a residual, as a share of the image's level.
     repetition : float
         Pixels per independent residual.
+    passes : int
+        Over the images, the first included.
     history : list of dict
+        Cost and its change for each pass from which the noise scale was kept.
     outcome, advice : str
     """
 
@@ -97,6 +100,7 @@ class AlbedoResult:
     disagreement: float
     noise: float
     repetition: float
+    passes: int
     history: list[dict]
     outcome: str
     advice: str

@@ -366,7 +366,7 @@ def eliminate_albedo(albedo, tensors, gradient, shared, precision, best):
         cost = 0.0
         for c in range(cols):
             off = albedo[r, c] - np.float32(1.0)
-            inverse = np.float32(1.0) / (aa[c] + precision)
+            inverse = np.float32(1.0) / max(aa[c] + precision, np.float32(1e-30))
             slope = ga[c] + precision * off
             tensors[0, r, c] -= ap[c] * ap[c] * inverse
             tensors[1, r, c] -= ap[c] * aq[c] * inverse

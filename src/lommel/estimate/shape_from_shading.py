@@ -15,7 +15,7 @@ leaves one 2x2 tensor per cell (`lommel.estimate.shading_kernels`); the linear s
 (`lommel.core.multigrid`) never sees an image. Most callers want `solve_surface`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,10 +25,14 @@ from lommel.core.normal_operator import prolong_add
 from lommel.estimate.albedo_field import fit_albedo
 from lommel.estimate.priors import Priors, PriorSettings, estimate_priors
 from lommel.estimate.problem import best_exposures, fresh_problem
+from lommel.estimate.shading_kernels import SUM_COUNT, SUM_RR
 
 COARSEST = 24  # posts along the shorter side of the coarsest level that sees the images
 COARSE_STEPS = 2  # Gauss-Newton steps per coarse level
-SHORTEST_STEP = 0.1  # of a Gauss-Newton step, before a rising cost is accepted as rounding
+SHORTEST_STEP = 0.1  # of a Gauss-Newton step: the cost that still rises has no way down
+ROUNDING = 1e-5  # relative, of a cost summed from float32 residuals
+POOR_FIT = 5.0  # noise standard errors, rms: more is not noise
+ODD_IMAGE = 1.5  # times the median of the others, which a false image spoils as well
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,10 @@ class SurfaceSolution:
         Images on the cells of the refined surface; NaN where not used.
     modelled, started : list of float32 array (rows - 1, cols - 1), image units
         What the refined and the initial surface predict there.
+    misfits : array (images,), dimensionless
+        Root mean square residual of each image, in noise standard errors.
+    separation : float32 array (rows - 1, cols - 1), dimensionless
+        How well albedo and slope can be told apart, 0 to 1; see `separation`.
     priors : Priors
         As estimated or given.
     """
@@ -84,6 +92,8 @@ class SurfaceSolution:
     measured: list
     modelled: list
     started: list
+    misfits: np.ndarray
+    separation: np.ndarray
     priors: Priors
 
 
@@ -123,10 +133,43 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
     if settings.estimate_albedo:
         _fit_albedo(finest, u, priors)
     modelled = [finest.predict(u, k) for k in range(len(views))]
+    sums = finest.assemble(u)[2]
+    misfits = np.sqrt(sums[:, SUM_RR] / np.maximum(sums[:, SUM_COUNT], 1))
     value = SurfaceSolution(
-        u, finest.albedo, finest.exposures, finest.hazes, finest.cells, modelled, started, priors
+        u,
+        finest.albedo,
+        finest.exposures,
+        finest.hazes,
+        finest.cells,
+        modelled,
+        started,
+        misfits,
+        separation(finest, u),
+        priors,
     )
-    return Solution(value, *_outcome(converged, history), history)
+    names = [view.name for view in views]
+    return Solution(value, *_outcome(converged, history, misfits, names), history)
+
+
+def separation(level, u):
+    """Share of the slope signal that is left when each cell's albedo is free.
+
+    Parameters
+    ----------
+    level : Problem
+    u : float32 array (rows, cols), m
+
+    Returns
+    -------
+    share : float32 array (rows - 1, cols - 1), dimensionless
+        0 with one image or images under one Sun: there albedo and slope cannot be told apart.
+        Towards 1 with Suns from all around. NaN where no image counts.
+    """
+    bound = replace(level, albedo_error=0.0, slope=np.zeros(2, np.float32)).assemble(u)[0]
+    free = replace(level, albedo_error=np.inf, slope=np.zeros(2, np.float32)).assemble(u)[0]
+    signal = bound[0] + bound[2]
+    share = (free[0] + free[2]) / np.where(signal > 0, signal, np.nan)
+    return np.clip(share, 0, 1)
 
 
 def _coarse_to_fine(finest, settings, history):
@@ -161,10 +204,13 @@ def _descend(level, u, steps, settings, history):
         length, last = 1.0, here.cost
         u, start = u + linear.x, u
         here = _look(level, u)
-        while here.cost > last and length > SHORTEST_STEP:
+        while not here.cost <= last and length > SHORTEST_STEP:
             length /= 2
             u = start + np.float32(length) * linear.x
             here = _look(level, u)
+        if not here.cost <= last * (1 + ROUNDING):  # no way down: stay
+            _look(level, start)
+            return start, False
         step = float(length * np.sqrt(dot(linear.x, linear.x) / linear.x.size))
         history.append(
             {
@@ -213,11 +259,25 @@ def _estimate_priors(level):
     return estimate_priors(level.cells, residuals, gains, level.surface.grid.spacing, respond)
 
 
-def _outcome(converged, history):
-    last = history[-1]
+def _outcome(converged, history, misfits, names):
+    """Name and sentence of how the solve ended."""
+    step = history[-1]["step_m"] if history else 0.0
+    worst = int(np.argmax(misfits))
+    others = np.median(np.delete(misfits, worst)) if misfits.size > 1 else misfits[worst]
+    if misfits.size > 2 and misfits[worst] > max(ODD_IMAGE * others, POOR_FIT):
+        return "contradiction", (
+            f"{names[worst]} contradicts the other images: it is left with residuals of "
+            f"{misfits[worst]:.1f} noise standard errors, the others with {others:.1f}. Check its "
+            "camera, Sun position and date, or leave it out."
+        )
+    if others > POOR_FIT:
+        return "poor_fit", (
+            f"The modelled images differ from the measured ones by {others:.1f} noise standard "
+            "errors: the DEM may be too far off, or cameras and Sun wrong. Do not use the result."
+        )
     if converged:
-        return "converged", f"Converged: the last step moved the surface by {last['step_m']:.3g} m."
+        return "converged", f"Converged: the last step moved the surface by {step:.3g} m."
     return "step_limit", (
-        f"Stopped while a step still moved the surface by {last['step_m']:.3g} m; "
-        "raise max_steps, or check the initial DEM."
+        f"Stopped while a step still moved the surface by {step:.3g} m; raise max_steps, or check "
+        "the initial DEM."
     )

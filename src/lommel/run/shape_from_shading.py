@@ -144,6 +144,8 @@ def _write_products(folder, scene, initial, refined, surface):
     modelled = np.where(np.isfinite(surface.measured[0]), surface.modelled[0], np.nan)
     write_raster(folder / "modelled.tif", modelled, cells, "modelled brightness")
     write_raster(folder / "albedo.tif", surface.albedo, cells, "albedo")
+    share = surface.separation
+    write_raster(folder / "separation.tif", share, cells, "slope signal left by a free albedo", "1")
     residual = relative_residual(surface)
     write_raster(folder / "residual.tif", residual, cells, "rms of modelled - measured", "percent")
 
@@ -201,12 +203,12 @@ def correlation(measured, modelled):
 def _write_exposures(folder, views, skipped, surface):
     with open(folder / "exposures.csv", "w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["image", "exposure", "haze", "used", "reason"])
+        writer.writerow(["image", "exposure", "haze", "residual_sigma", "used", "reason"])
         for k, view in enumerate(views):
             exposure, haze = float(surface.exposures[k]), float(surface.hazes[k])
-            writer.writerow([view.name, exposure, haze, 1, ""])
+            writer.writerow([view.name, exposure, haze, float(surface.misfits[k]), 1, ""])
         for skip in skipped:
-            writer.writerow([skip["image"], "", "", 0, skip["reason"]])
+            writer.writerow([skip["image"], "", "", "", 0, skip["reason"]])
 
 
 def _results(scene, refined, surface):
