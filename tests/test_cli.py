@@ -14,6 +14,7 @@ from lommel.cli import main
 from lommel.errors import ConvergenceError
 from lommel.io.raster import write_raster
 from lommel.scene.body import MOON, to_xyz
+from lommel.scene.camera import nadir_rotation
 from lommel.scene.geometry import surface_normals, viewing_geometry
 from lommel.scene.grid import Grid, grid_from_bounds, read_crs
 
@@ -327,6 +328,95 @@ def test_brackets_colons_and_length_of_a_path_are_printed_as_they_are(refused, s
     path = scene / "[red] :moon: [/]" / ("long " * 30) / "dem[1].tif"
     message = refused("a.tif", "--dem", path, *REQUEST[4:])
     assert f"error {path} cannot be opened as a raster: there is no such file\n" in message
+
+
+# --- Raw images with cameras ----------------------------------------------------------------------
+
+
+def write_camera(path, longitude_deg=0.066, latitude_deg=0.06, pitch=1.0):
+    """A nadir camera 10 km above the DEM with 100 m per pixel."""
+    place = to_xyz(MOON, *np.radians([longitude_deg, latitude_deg]), 10e3)
+    rotation = nadir_rotation(place, np.array([0.0, 1.0, 0.0]))
+    values = {
+        "fu": 100.0 * pitch,
+        "fv": 100.0 * pitch,
+        "cu": 29.5 * pitch,
+        "cv": 29.5 * pitch,
+        "u_direction": "1 0 0",
+        "v_direction": "0 1 0",
+        "w_direction": "0 0 1",
+        "C": " ".join(repr(float(value)) for value in place),
+        "R": " ".join(repr(float(value)) for value in rotation.T.ravel()),
+        "pitch": pitch,
+    }
+    path.write_text("".join(f"{key} = {value}\n" for key, value in values.items()) + "NULL\n")
+
+
+@pytest.fixture
+def raw(scene):
+    """The working folder with two raw images more, whose cameras lie beside them."""
+    row, col = np.indices((60, 60))
+    for name, phase in (("p", 0.0), ("q", 1.0)):
+        values = 100 + 20 * np.sin(col / 4 + phase) * np.cos(row / 5)
+        nowhere = Grid((60, 60), GRID.affine, SimpleNamespace(to_wkt=lambda: None))
+        write_raster(f"{name}.tif", values, nowhere, "brightness")
+        write_camera(scene / f"{name}.tsai")
+    write_tables(scene, ("p", "q"))
+    return scene
+
+
+RAW = ("p.tif", "q.tif", "--dem", "dem.tif", "--output", "out", "--sun-positions", "sun.txt")
+
+
+def test_raw_images_find_the_cameras_beside_them(raw, lommel):
+    ended = lommel("sfs", *RAW, "--max-steps", "1")
+    assert ended.status == 0, ended.err
+    assert (raw / "out" / "dem.tif").is_file()
+
+
+@pytest.mark.parametrize("request_", [("--cameras", "p.tsai"), ("--spacing", "0")])
+def test_request_for_raw_images_that_cannot_work_is_an_error(raw, lommel, request_):
+    ended = lommel("sfs", *RAW, *request_)
+    expected = {
+        "--cameras": "--cameras names 1 files for 2 images. Name one per image",
+        "--spacing": "spacing = 0.0 is not a post spacing",
+    }
+    assert (ended.status, ended.out) == (2, "")
+    assert expected[request_[0]] in ended.err
+    assert not (raw / "out").exists()
+
+
+def test_raw_images_need_a_sun(raw, lommel):
+    ended = lommel("sfs", *RAW[:-2])
+    assert ended.status == 2
+    assert "The camera files do not tell where the Sun stood. Name a table" in ended.err
+    (raw / "sun.txt").write_text("x 1.5e11 0 0\n")
+    assert "sun.txt has no entry for p.tif" in lommel("sfs", *RAW).err
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("fu = 1\n", "q.tsai: fv is missing or malformed"),
+        ("\x00\x01", "q.tsai: fu is missing or malformed"),
+        (None, "q.tif: its camera does not see the DEM. Check that camera and DEM"),
+    ],
+)
+def test_raw_image_whose_camera_fails_is_left_out(raw, lommel, text, message):
+    if text is None:
+        write_camera(raw / "q.tsai", longitude_deg=90.0)
+    else:
+        (raw / "q.tsai").write_text(text)
+    ended = lommel("sfs", *RAW, "--max-steps", "1")
+    assert ended.status == 0, ended.err
+    assert message in ended.err
+
+
+def test_camera_of_an_unknown_kind_is_an_error(raw, lommel):
+    (raw / "q.xyz").write_text("")
+    ended = lommel("sfs", "q.tif", *RAW[2:], "--cameras", "q.xyz")
+    assert ended.status == 2
+    assert "q.xyz: no reader for cameras in .xyz files. Give one of .tsai" in ended.err
 
 
 # --- Failures inside ------------------------------------------------------------------------------

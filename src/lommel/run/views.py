@@ -152,7 +152,9 @@ def _terrain_grid(dems, cameras, settings, body):
     crs = read_crs(settings.crs, body, "--crs") if settings.crs else grids[0].crs
     bounds = np.array([bounds_in(grid, crs) for grid in grids])
     union = *bounds[:, :2].min(axis=0).tolist(), *bounds[:, 2:].max(axis=0).tolist()
-    spacing = settings.spacing or (dem_spacing if is_fine_enough else gsd)
+    spacing = settings.spacing
+    if spacing is None:
+        spacing = dem_spacing if is_fine_enough else gsd
     grid = grid_from_bounds(settings.bounds or union, spacing, crs, body)
     refuse_huge(grid)
     return grid

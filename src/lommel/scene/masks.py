@@ -102,7 +102,7 @@ def shadow_thresholds(images, settings):
     if settings.shadow_threshold is not None:
         return np.full(len(images), float(settings.shadow_threshold))
     lit = np.array([lit_brightness(image) for image in images])
-    least = DARK_IMAGE * np.median(lit)
+    least = DARK_IMAGE * np.median(lit) if images else 0.0
     return np.array(
         [shadow_threshold(image, max(own, least)) for image, own in zip(images, lit, strict=True)]
     )
