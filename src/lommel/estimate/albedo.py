@@ -27,6 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse.linalg import splu
 
+from lommel.core.least_squares import Solution
 from lommel.core.reflectance import reflectance_model
 from lommel.errors import InputError
 from lommel.estimate.albedo_arrays import OWN, SHARED, State
@@ -77,10 +78,8 @@ class AlbedoResult:
         Standard error of a residual, as a share of the image's level.
     repetition : float
         Pixels per independent residual.
-    passes : int
-        Over the images, the first included.
     history : list of dict
-        Cost and its change for each pass from which the noise scale was kept.
+        Cost and its change for each step from which the noise scale was kept.
     outcome, advice : str
     """
 
@@ -100,7 +99,6 @@ class AlbedoResult:
     disagreement: float
     noise: float
     repetition: float
-    passes: int
     history: list[dict]
     outcome: str
     advice: str
@@ -132,8 +130,8 @@ def estimate_albedo(observations, grid, heights, settings=None, progress=None):
         listing = [f"  {o.name}: {r}" for o, r in zip(observations, reasons, strict=True)]
         raise InputError("No image can be used.\n" + "\n".join(listing[:20]))
     problem = _pose(samples, grid.shape, settings)
-    point, history, outcome, advice = _iterate(problem, levels, progress or (lambda *_: None))
-    return _result(problem, point, reasons, history, outcome, advice)
+    solution = _iterate(problem, levels, progress or (lambda *_: None))
+    return _result(problem, solution, reasons)
 
 
 def _pose(samples, shape, settings):
@@ -150,7 +148,7 @@ def _pose(samples, shape, settings):
 
 
 def _iterate(problem, levels, progress):
-    """Steps until the cost stays; returns the last point, the history and the outcome."""
+    """Steps until the cost stays; the solution's value is the last point."""
     settings = problem.settings
     state = State(
         levels / levels.mean(),
@@ -180,12 +178,13 @@ def _iterate(problem, levels, progress):
             damping = max(4 * damping, 1e-3)
         history.append({"step": step + 1, "cost": point.objective, "change": change})
         if abs(change) < settings.tolerance:
-            return point, history, "converged", f"Converged after {step + 1} passes."
+            advice = f"Converged after {step + 1} steps."
+            return Solution(point, "converged", advice, history)
     advice = (
-        f"Stopped after {settings.max_steps} passes while the cost still changed by "
-        f"{100 * abs(change):.2g} % per pass; raise max_steps."
+        f"Stopped after {settings.max_steps} steps while the cost still changed by "
+        f"{100 * abs(change):.2g} % per step; raise max_steps."
     )
-    return point, history, "step_limit", advice
+    return Solution(point, "step_limit", advice, history)
 
 
 def _weighting(point):
@@ -235,8 +234,9 @@ def _published_step(problem, point):
     return change.ravel()
 
 
-def _result(problem, point, reasons, history, outcome, advice):
+def _result(problem, solution, reasons):
     """Bring the gauge to mean exposure 1, and collect."""
+    point = solution.value
     used = np.array([not reason for reason in reasons])
     point.scale, point.repetition = _weighting(point)
     noise = noise_scale(point.sums.histogram)
@@ -276,9 +276,9 @@ def _result(problem, point, reasons, history, outcome, advice):
         ),
         noise=noise,
         repetition=point.repetition,
-        history=history,
-        outcome=outcome,
-        advice=advice + _remarks(problem, groups),
+        history=solution.history,
+        outcome=solution.outcome,
+        advice=solution.advice + _remarks(problem, groups),
     )
 
 

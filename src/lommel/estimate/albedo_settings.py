@@ -37,7 +37,7 @@ class AlbedoSettings:
         Expected standard deviation of haze, as a share of the image's level.
     masks : MaskSettings
     max_steps : int
-        Passes over the images.
+        Each is one pass over the images.
     tolerance : float
         The iteration ends when the cost falls by less than this share in one step.
     """
