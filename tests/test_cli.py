@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from affine import Affine
 from pyproj import CRS
 
 from lommel import __version__
@@ -328,6 +329,20 @@ def test_brackets_colons_and_length_of_a_path_are_printed_as_they_are(refused, s
     path = scene / "[red] :moon: [/]" / ("long " * 30) / "dem[1].tif"
     message = refused("a.tif", "--dem", path, *REQUEST[4:])
     assert f"error {path} cannot be opened as a raster: there is no such file\n" in message
+
+
+def test_sliver_of_an_image_does_not_spoil_the_others(scene, lommel):
+    """One row of posts holds no slope: its undefined noise kept the whole surface in place."""
+    affine = GRID.affine @ Affine.translation(0, GRID.shape[0] - 1)
+    write_raster("c.tif", np.full(GRID.shape, 90.0), Grid(GRID.shape, affine, GRID.crs), "b")
+    for table in ("sun.txt", "craft.txt"):
+        lines = (scene / table).read_text()
+        (scene / table).write_text(lines + lines.splitlines()[0].replace("a ", "c ", 1))
+    ended = lommel("sfs", "c.tif", *REQUEST, "--max-steps", "1")
+    assert ended.status == 0
+    assert "left out c.tif shares only 1 x 40 posts with the DEM; 8 along each" in ended.err
+    record = json.loads((scene / "out" / "run.json").read_text())
+    assert record["results"]["height_change_rms_m"] > 0.1
 
 
 # --- Raw images with cameras ----------------------------------------------------------------------

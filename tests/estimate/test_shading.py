@@ -2,13 +2,19 @@
 
 import numpy as np
 import pytest
+from affine import Affine
+from scipy.ndimage import binary_dilation, zoom
 
 from lommel.core.normal_operator import slope_adjoint
 from lommel.core.reflectance import reflectance_model, user_model
+from lommel.estimate.problem import fresh_problem
 from lommel.estimate.shading_kernels import SUM_COUNT, SUM_FF, SUM_FM, sample_cells
+from lommel.estimate.surface import Surface
 from lommel.scene.geometry import surface_normals, viewing_geometry
+from lommel.scene.grid import Grid
+from lommel.scene.shadows import sunlit
 
-from .shading_scene import EXPOSURE, exact_problem, hills, patch_grid
+from .shading_scene import EXPOSURE, blank_view, exact_problem, hills, patch_grid
 
 # Central differences with steps of 0.05 m against the analytic derivative: float32 images carry
 # 1e-5, a step changes the cost by more than 1e-3 of itself, and rays leave out a term of the size
@@ -141,3 +147,22 @@ def test_missing_pixels_do_not_spread_beyond_their_neighbours():
     image[20, 20] = np.nan
     out = sample(image, 2.0, 2.0)
     assert np.isnan(out).sum() == 4
+
+
+def test_cast_shadow_agrees_with_ray_marching_on_the_sphere():
+    """Against `lommel.scene.shadows`, which follows each post's own ray over the curved body."""
+    grid = patch_grid(96, 96)
+    heights = hills(grid.shape, smooth=4.0, rms=40.0)
+    view = blank_view(grid, 100.0)
+    problem = fresh_problem(Surface(grid, 0.0), heights, [view], reflectance_model(), None)
+    problem.prepare_geometry(heights)
+    problem.cells[0][:] = 0.0  # dark everywhere: the image denies no shadow
+    problem.find_shadows(heights)
+    fine = Grid((191, 191), grid.affine @ Affine.scale(0.5), grid.crs, grid.body)
+    fine_heights = zoom(heights, 191 / 96, order=1, grid_mode=False)
+    lit = sunlit(fine, fine_heights, view.sun_position)[1::2, 1::2]
+    shadow = problem.shadows[0]
+    assert 0.02 < (~lit).mean() < 0.6
+    assert shadow[~lit].mean() > 0.97  # all of it, but for rims thinner than a post
+    grown = binary_dilation(~lit, iterations=3)
+    assert shadow[~grown].mean() < 0.01

@@ -260,6 +260,7 @@ def test_dem_without_a_height_is_refused(world):
         (GridSettings(spacing=0.0), "spacing = 0.0 is not a post spacing"),
         (GridSettings(spacing=-5.0), "spacing = -5.0 is not a post spacing"),
         (GridSettings(spacing=0.01), "would have 400000 x .* Give a larger --spacing"),
+        (GridSettings(bounds=(3e3, 2e3, 4e3, 2.1e3)), "would have 1 x 10 posts; a slope needs 2"),
         (GridSettings(crs="EPSG:4326"), "--crs: the CRS 'WGS 84' has a radius of 6378.1 km"),
         (GridSettings(crs="moonish"), "--crs: 'moonish' is not a CRS"),
     ],

@@ -8,7 +8,7 @@ difference to the expected surface. Most callers want `lommel.estimate.shape_fro
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import binary_dilation, gaussian_filter
 
 from lommel.core.multigrid import add_long_waves, coarse_masses, dot, threads_for
 from lommel.core.normal_operator import apply_operator, coarse_shape, restrict, slope_adjoint
@@ -17,13 +17,17 @@ from lommel.estimate.shading_kernels import (
     SUM_FF,
     SUM_FM,
     assemble,
+    cast_shadow,
     cosines,
     eliminate_albedo,
     predict,
     sample_cells,
 )
+from lommel.scene.geometry import unit
 
 SLOPE_STEP = 0.01  # for the change of brightness with slope: R bends little over half a degree
+LOWEST_SUN = 0.01  # sine of the elevation below which shadows are not followed any longer
+DARK = 0.5  # of the median brightness: the image itself denies a shadow that is brighter
 HUBER_SCALE = 3.0  # noise standard errors from which a residual counts as an outlier
 
 
@@ -69,6 +73,7 @@ class Problem:
     slope: np.ndarray
     expected: np.ndarray
     albedo_error: float = 0.0
+    shadows: list = field(default_factory=list)
     geometry: list = field(default_factory=list)
 
     def prepare_geometry(self, u):
@@ -221,6 +226,24 @@ class Problem:
             reference = self.initial if view.is_projected else np.zeros((1, 1), np.float32)
             with threads_for(u.shape):
                 sample_cells(view.image, planes, lattice.step, u, reference, cells)
+        for cells, shadow in zip(self.cells, self.shadows, strict=False):
+            cells[shadow] = np.nan
+
+    def find_shadows(self, u):
+        """Blank the cells that terrain shadows, where the images are dark there as well."""
+        lattice, at_nodes, frame, _, _ = self.geometry
+        self.shadows = []
+        for view, cells in zip(self.views, self.cells, strict=True):
+            to_sun = unit(view.sun_position - frame.xyz)
+            sine = np.einsum("...i,...i", to_sun, frame.up)
+            lateral = to_sun / np.maximum(sine, LOWEST_SUN)[..., None] - frame.up
+            rays = self.surface.posts_crossed(lattice, at_nodes, lateral).astype(np.float32)
+            shadow = np.empty(cells.shape, np.bool_)
+            with threads_for(u.shape):
+                cast_shadow(u, rays, lattice.step, np.float32(u.max()), shadow)
+            is_dark = ~(cells > DARK * np.nanmedian(cells[::4, ::4]))
+            self.shadows.append(binary_dilation(shadow & is_dark))
+            cells[self.shadows[-1]] = np.nan
 
     def coarser(self):
         """The same problem on every second post."""
@@ -228,6 +251,7 @@ class Problem:
             self,
             exposures=self.exposures.copy(),
             stride=2 * self.stride,
+            shadows=[],
             initial=coarse_posts(self.initial),
             expected=coarse_posts(self.expected),
             cells=[coarse_cells(cells) for cells in self.cells],
@@ -276,10 +300,8 @@ def light_planes(frame, view, model):
     -------
     planes : float32 array (8, node_rows, node_cols)
     """
-    to_sun = view.sun_position - frame.xyz
-    to_sun /= np.linalg.norm(to_sun, axis=-1, keepdims=True)
-    to_camera = view.position - frame.xyz
-    to_camera /= np.linalg.norm(to_camera, axis=-1, keepdims=True)
+    to_sun = unit(view.sun_position - frame.xyz)
+    to_camera = unit(view.position - frame.xyz)
     phase = np.arccos(np.clip(np.einsum("...i,...i", to_sun, to_camera), -1, 1))
     share, factor = model.phase_terms(phase)
     planes = [np.einsum("...i,...i", frame.c[k], to_sun) for k in range(3)]

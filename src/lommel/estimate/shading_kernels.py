@@ -127,6 +127,55 @@ def sample_cells(image, planes, step, u, reference, out):
             out[r, c] = _sample(image, line, sample)
 
 
+@njit(cache=True, parallel=True, fastmath=FAST)
+def cast_shadow(u, planes, step, highest, out):
+    """True on cells from which the way to the Sun meets terrain.
+
+    Parameters
+    ----------
+    u : float32 array (rows, cols), m
+    planes : float32 array (2, node_rows, node_cols), posts per m
+        How far a ray to the Sun goes along rows and columns while it rises by 1 m.
+    step : int
+        Cells from node to node.
+    highest : float32, m
+        Of ``u``.
+    out : bool array (rows - 1, cols - 1)
+    """
+    rows, cols = u.shape
+    for i in prange(rows - 1):
+        r = np.int64(i)
+        at = np.empty((2, cols - 1), np.float32)
+        for k in range(2):
+            expand_row(planes[k], (r + 0.5) / step, step, at[k])
+        for c in range(cols - 1):
+            out[r, c] = _meets_terrain(u, r, c, at[0, c], at[1, c], highest)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _meets_terrain(u, r, c, per_metre_row, per_metre_col, highest):
+    """Follow the ray from a cell's centre, one post along the longer axis at a time."""
+    half, quarter = np.float32(0.5), np.float32(0.25)
+    length = max(abs(per_metre_row), abs(per_metre_col))
+    if length == 0:
+        return False
+    rise = np.float32(1.0) / length
+    d_row, d_col = per_metre_row * rise, per_metre_col * rise
+    height = quarter * (u[r, c] + u[r, c + 1] + u[r + 1, c] + u[r + 1, c + 1])
+    row, col = r + half, c + half
+    while True:
+        row, col, height = row + d_row, col + d_col, height + rise
+        inside = 0 <= row and 0 <= col and row <= u.shape[0] - 1 and col <= u.shape[1] - 1
+        if not inside or height > highest:
+            return False
+        i, j = min(np.int64(row), u.shape[0] - 2), min(np.int64(col), u.shape[1] - 2)
+        v, h = np.float32(row - i), np.float32(col - j)
+        upper = u[i, j] + h * (u[i, j + 1] - u[i, j])
+        lower = u[i + 1, j] + h * (u[i + 1, j + 1] - u[i + 1, j])
+        if upper + v * (lower - upper) > height:
+            return True
+
+
 @njit(cache=True, nogil=True, fastmath=FAST)
 def _slopes_row(upper, lower, inverse_row, inverse_col, p, q):
     half = np.float32(0.5)

@@ -122,6 +122,7 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
     finest = fresh_problem(surface, initial, views, model, albedo)
     finest.prepare_geometry(finest.initial)
     finest.sample_images(finest.initial)
+    finest.find_shadows(finest.initial)
     finest.exposures[:] = best_exposures(finest.assemble(finest.initial)[2], finest.exposures)
     if not isinstance(priors, Priors):
         spacing = (surface.grid.spacing[0] * surface.grid.spacing[1]) ** 0.5
@@ -188,6 +189,7 @@ def _coarse_to_fine(finest, settings, history):
         if level is finest:
             level.prepare_geometry(u)
             level.sample_images(u)
+            level.find_shadows(u)
         steps = settings.max_steps if level is finest else COARSE_STEPS
         u, converged = _descend(level, u, steps, settings, history)
     return u, converged
@@ -208,10 +210,10 @@ def _descend(level, u, steps, settings, history):
             length /= 2
             u = start + np.float32(length) * linear.x
             here = _look(level, u)
+        step = float(length * np.sqrt(dot(linear.x, linear.x) / linear.x.size))
         if not here.cost <= last * (1 + ROUNDING):  # no way down: stay
             _look(level, start)
-            return start, False
-        step = float(length * np.sqrt(dot(linear.x, linear.x) / linear.x.size))
+            return start, step < settings.step_tolerance
         history.append(
             {
                 "stride": level.stride,

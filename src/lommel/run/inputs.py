@@ -127,7 +127,7 @@ def read_scene(files, grid_settings=None, prefer="images", body=MOON, progress=i
     grid = choose_grid(
         list(image_grids.values()), dem_grids, grid_settings or GridSettings(), prefer, body
     )
-    refuse_huge(grid)
+    refuse_unusable(grid)
     heights = read_heights(files.dems, grid, body)
     observations = []
     for path in progress(list(image_grids)):
@@ -261,9 +261,14 @@ def refuse_duplicates(paths):
         )
 
 
-def refuse_huge(grid):
-    """Raise `InputError` when a grid has more posts than any machine holds."""
+def refuse_unusable(grid):
+    """Raise `InputError` when a grid has more posts than any machine holds, or none for slopes."""
     rows, cols = grid.shape
+    if min(rows, cols) < 2:
+        raise InputError(
+            f"The products would have {rows} x {cols} posts; a slope needs 2 along each side. "
+            "Give a smaller --spacing or wider --bounds, or images that share more with the DEM."
+        )
     if rows * cols > POST_LIMIT:
         raise InputError(
             f"The products would have {rows} x {cols} posts, more than {POST_LIMIT}. "

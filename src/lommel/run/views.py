@@ -21,7 +21,7 @@ from lommel.run.inputs import (
     read_heights,
     read_scene,
     refuse_duplicates,
-    refuse_huge,
+    refuse_unusable,
 )
 from lommel.scene.body import MOON
 from lommel.scene.camera import ReducedCamera
@@ -29,7 +29,8 @@ from lommel.scene.grid import Grid, bounds_in, grid_from_bounds, read_crs
 from lommel.scene.masks import CLIPPED, MaskSettings, shadow_thresholds
 from lommel.scene.view import CameraView, OrthoView
 
-MARGIN = 2  # pixels beside unusable ones that are left out: the reach of interpolation
+MARGIN = 1  # pixels beside unusable ones that are left out: they hold part of them
+LEAST_SHARED = 8  # rows and columns of posts; a thinner sliver of an image tells no slope apart
 LEAST_LIT = 0.01  # share of an image's pixels that must be lit and unclipped for it to be used
 
 
@@ -77,7 +78,12 @@ def read_views(files, grid_settings=None, masks=None, body=MOON, progress=iter):
     if flat:
         scene = read_scene(replace(files, images=flat), grid_settings, "dem", body, progress)
         grid, heights, skipped = scene.grid, scene.heights, list(scene.skipped)
-        views = [(OrthoView(o), o.saturation) for o in scene.observations]
+        views = [
+            (OrthoView(observation), observation.saturation)
+            for observation in scene.observations
+            if min(observation.window.shape) >= LEAST_SHARED
+        ]
+        skipped += [_sliver(o) for o in scene.observations if min(o.window.shape) < LEAST_SHARED]
     else:
         grid = _terrain_grid(files.dems, cameras, grid_settings, body)
         heights = read_heights(files.dems, grid, body)
@@ -94,6 +100,15 @@ def read_views(files, grid_settings=None, masks=None, body=MOON, progress=iter):
     if not usable:
         raise InputError("No image can be used.\n" + listing(skipped))
     return ViewedTerrain(grid, heights, usable, skipped)
+
+
+def _sliver(observation):
+    rows, cols = observation.window.shape
+    return Skipped(
+        observation.name,
+        f"{observation.name} shares only {rows} x {cols} posts with the DEM; {LEAST_SHARED} along "
+        "each side are needed.",
+    )
 
 
 def mask_views(views, settings):
@@ -156,7 +171,7 @@ def _terrain_grid(dems, cameras, settings, body):
     if spacing is None:
         spacing = dem_spacing if is_fine_enough else gsd
     grid = grid_from_bounds(settings.bounds or union, spacing, crs, body)
-    refuse_huge(grid)
+    refuse_unusable(grid)
     return grid
 
 
