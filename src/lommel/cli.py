@@ -100,9 +100,15 @@ def albedo(
     haze: Annotated[
         bool | None, typer.Option(help=f"Estimate an offset per image. {BY_SOLVER}yes.")
     ] = None,
+    phase_factor: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            help="c1 (per radian) and c2 of the factor exp(-c1 phase) + c2; 0 0 is no factor. "
+            f"{BY_SOLVER}the Moon's."
+        ),
+    ] = None,
     fit_phase_factor: Annotated[
-        bool | None,
-        typer.Option(help=f"Estimate c1, c2 of the factor exp(-c1 phase) + c2. {BY_SOLVER}yes."),
+        bool | None, typer.Option(help=f"Refine c1 and c2 from the images. {BY_SOLVER}yes.")
     ] = None,
     fit_falloff: Annotated[
         bool | None, typer.Option(help=f"Estimate the lens's darker corners. {BY_SOLVER}yes.")
@@ -121,6 +127,7 @@ def albedo(
         solver=solver,
         loss=loss,
         haze=haze,
+        phase_factor=phase_factor,
         fit_phase_factor=fit_phase_factor,
         fit_falloff=fit_falloff,
         reflectance=reflectance,

@@ -24,7 +24,7 @@ class AlbedoSettings:
     haze : bool
         Estimate an offset per image.
     phase_factor : (c1, c2) or None
-        Multiplies the reflectance by exp(-c1 phase) + c2, phase in rad; None multiplies by 1.
+        Multiplies the reflectance by exp(-c1 phase) + c2, phase in rad; None and (0, 0) by 1.
     fit_phase_factor : bool
         Estimate c1 and c2, starting from ``phase_factor``.
     fit_falloff : bool
