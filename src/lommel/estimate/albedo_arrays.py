@@ -80,10 +80,10 @@ class Sums(NamedTuple):
         Sums of weight, weight I, weight M and of weight times the derivatives of M.
     patches : array (blocks, images, 8, 8)
         Sum of the scores (derivative of the loss) in each patch of each image.
-    score_square : array (blocks,)
+    score_square : array (blocks, 1)
     histogram : array (blocks, SCALE_BINS)
         Sizes of residuals times the root of their precision.
-    cost : array (blocks,)
+    cost : array (blocks, 1)
     """
 
     own: np.ndarray
@@ -171,9 +171,9 @@ def empty_sums(images, pairs):
         shared_gradient=np.zeros((BLOCKS, SHARED)),
         means=np.zeros((BLOCKS, images, 3 + SHARED)),
         patches=np.zeros((BLOCKS, images, PATCHES, PATCHES)),
-        score_square=np.zeros(BLOCKS),
+        score_square=np.zeros((BLOCKS, 1)),
         histogram=np.zeros((BLOCKS, SCALE_BINS)),
-        cost=np.zeros(BLOCKS),
+        cost=np.zeros((BLOCKS, 1)),
     )
 
 

@@ -97,7 +97,7 @@ def visit(problem, state, mean_log_albedo, scale, repetition):
     accumulate(problem.samples, problem.pairs, state, scale, loss, maps, blocks)
     sums = Sums(*(part.sum(axis=0) for part in blocks))
     point = Point(state, mean_log_albedo, scale, repetition, maps, sums, 0.0)
-    point.objective = float(sums.cost) / repetition
+    point.objective = float(sums.cost[0]) / repetition
     if problem.settings.solver == "projection":
         residual, _, error = priors(problem, point)
         point.objective += 0.5 * float(np.sum((residual / error) ** 2))
@@ -140,7 +140,7 @@ def effective_repetition(sums):
     -------
     repetition : float
     """
-    total = max(float(sums.score_square), 1e-300)
+    total = max(float(sums.score_square[0]), 1e-300)
     apart = float(np.sum(sums.patches**2)) / total
     together = float(np.sum(sums.patches.sum(axis=0) ** 2)) / total
     return max(1.0, apart, together)

@@ -14,8 +14,10 @@ of the image's level) and by the shared ones (c1, c2, v2, v4). Loops run along r
 sums are kept per block of rows, so that results do not depend on the number of threads.
 """
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
-from numba import njit, prange
+from numba import get_num_threads, njit
 
 from lommel.estimate.albedo_arrays import BLOCKS, OWN, PATCHES, SHARED, Sums, Work
 from lommel.estimate.albedo_rows import (
@@ -24,6 +26,7 @@ from lommel.estimate.albedo_rows import (
     count_row,
     dot3,
     image_sums,
+    inner,
     mean_sums,
     residual_sums,
     shared_sums,
@@ -33,7 +36,7 @@ from lommel.estimate.albedo_rows import (
 SWEEPS = 5  # weightings of the pixels of a post; the robust mean then moves below 1e-3 of its error
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _first_sweep(row, samples, images, state, work, maps):
     """Brightness of every image in this row, and how many there are."""
     count, freedom = maps.image_count[row], maps.freedom[row]
@@ -57,7 +60,7 @@ def _first_sweep(row, samples, images, state, work, maps):
             freedom[j] *= (count[j] - 1) / count[j]
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _best_albedo(row, samples, images, state, scale, loss, work, maps):
     """Albedo of this row by repeated weighting, from the plain weighted mean on.
 
@@ -90,7 +93,7 @@ def _best_albedo(row, samples, images, state, scale, loss, work, maps):
             albedo[j] = work.top[j] * work.inverse[j]
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _second_sweep(row, samples, images, state, scale, loss, work, sums, maps):
     """Sums of every image in this row, given the albedo."""
     albedo, scatter, count = maps.albedo[row], maps.scatter[row], maps.image_count[row]
@@ -145,7 +148,7 @@ def _second_sweep(row, samples, images, state, scale, loss, work, sums, maps):
         sums.score_square[0] += score_square
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _eliminate(samples, images, pairs, place_of, work, sums):
     """Subtract what the albedo takes up: products of w M J over every pair of images."""
     for g in range(SHARED):
@@ -179,7 +182,7 @@ def _eliminate(samples, images, pairs, place_of, work, sums):
             sums.shared_pixels[pair] += _seen_by_both(work, a, b, low, high, first, samples, j)
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _seen_by_both(work, a, b, low, high, first, samples, j):
     total = 0.0
     for col in range(low, high):
@@ -187,7 +190,7 @@ def _seen_by_both(work, a, b, low, high, first, samples, j):
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _place(samples, k, row):
     """First column, width and flat slice of image k in this row of the grid."""
     first, width = samples.windows[k, 1], samples.windows[k, 3]
@@ -195,7 +198,7 @@ def _place(samples, k, row):
     return first, width, slice(start, start + width)
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _images_in(row, samples, place_of):
     """Images whose window holds this row; ``place_of`` receives their place in the list."""
     images = np.empty(samples.starts.size, np.int64)
@@ -209,7 +212,7 @@ def _images_in(row, samples, place_of):
     return images[:count]
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _most_images(first_row, last_row, samples):
     """Largest number of images in one row of the block."""
     change = np.zeros(last_row - first_row + 1, np.int64)
@@ -222,26 +225,7 @@ def _most_images(first_row, last_row, samples):
     return np.cumsum(change).max()
 
 
-@njit(cache=True, error_model="numpy")
-def _block_of(sums, block):
-    """The sums of one block, as views."""
-    return Sums(
-        sums.own[block],
-        sums.pairs[block],
-        sums.shared_pixels[block],
-        sums.border[block],
-        sums.square[block],
-        sums.gradient[block],
-        sums.shared_gradient[block],
-        sums.means[block],
-        sums.patches[block],
-        sums.score_square[block : block + 1],
-        sums.histogram[block],
-        sums.cost[block : block + 1],
-    )
-
-
-@njit(cache=True, error_model="numpy")
+@inner
 def _work_for(images, cols):
     return Work(
         np.zeros((images, cols)),
@@ -255,7 +239,18 @@ def _work_for(images, cols):
     )
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
+def _visit_rows(first_row, last_row, samples, pairs, state, scale, loss, maps, sums):
+    work = _work_for(_most_images(first_row, last_row, samples), maps.albedo.shape[1])
+    place_of = np.empty(samples.starts.size, np.int64)
+    for row in range(first_row, last_row):
+        images = _images_in(row, samples, place_of)
+        _first_sweep(row, samples, images, state, work, maps)
+        _best_albedo(row, samples, images, state, scale, loss, work, maps)
+        _second_sweep(row, samples, images, state, scale, loss, work, sums, maps)
+        _eliminate(samples, images, pairs, place_of, work, sums)
+
+
 def accumulate(samples, pairs, state, scale, loss, maps, sums):
     """Visit every pixel once: best albedo, then the sums of a Gauss-Newton step.
 
@@ -274,18 +269,14 @@ def accumulate(samples, pairs, state, scale, loss, maps, sums):
     sums : Sums
         Zeros from `empty_sums`; added to.
     """
-    rows, cols = maps.albedo.shape
+    rows = maps.albedo.shape[0]
     size = (rows + BLOCKS - 1) // BLOCKS
-    for index in prange(BLOCKS):
-        block = np.int64(index)
-        first_row, last_row = block * size, min((block + 1) * size, rows)
-        if first_row < last_row:
-            here = _block_of(sums, block)
-            work = _work_for(_most_images(first_row, last_row, samples), cols)
-            place_of = np.empty(samples.starts.size, np.int64)
-            for row in range(first_row, last_row):
-                images = _images_in(row, samples, place_of)
-                _first_sweep(row, samples, images, state, work, maps)
-                _best_albedo(row, samples, images, state, scale, loss, work, maps)
-                _second_sweep(row, samples, images, state, scale, loss, work, here, maps)
-                _eliminate(samples, images, pairs, place_of, work, here)
+
+    def visit_block(block):
+        first, last = block * size, min((block + 1) * size, rows)
+        if first < last:
+            here = Sums(*(part[block] for part in sums))
+            _visit_rows(first, last, samples, pairs, state, scale, loss, maps, here)
+
+    with ThreadPoolExecutor(get_num_threads()) as threads:
+        list(threads.map(visit_block, range(BLOCKS)))

@@ -12,8 +12,11 @@ LEAST_SQUARES, HUBER, CAUCHY = 0, 1, 2
 HUBER_TUNING, CAUCHY_TUNING = 1.345, 2.385  # 95 % efficient on Gaussian noise (Holland & Welsch)
 LOSSES = {"least-squares": LEAST_SQUARES, "huber": HUBER, "cauchy": CAUCHY}
 
+# for functions that only compiled code calls: a third less time to compile
+inner = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
-@njit(cache=True, error_model="numpy")
+
+@inner
 def count_row(weight, count, freedom):
     """Add a row of an image to the number of images and to the sum of weights."""
     for j in range(weight.size):
@@ -21,7 +24,7 @@ def count_row(weight, count, freedom):
         freedom[j] += weight[j]
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def mean_sums(measured, weight, brightness, derivatives, means):
     """Sums of weight, weight times I, times M and times the derivatives of M, along a row."""
     for j in range(measured.size):
@@ -32,7 +35,7 @@ def mean_sums(measured, weight, brightness, derivatives, means):
             means[3 + g] += weight[j] * derivatives[g, j]
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def robust_weight(x, loss):
     """Derivative of the loss by x, divided by x; x is a residual in standard errors."""
     if loss == HUBER:
@@ -42,7 +45,7 @@ def robust_weight(x, loss):
     return 1.0
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def robust_loss(x, loss):
     """Loss of a residual x in standard errors; x^2/2 near zero."""
     if loss == HUBER:
@@ -54,7 +57,7 @@ def robust_loss(x, loss):
     return 0.5 * x * x
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def brightness_row(reflectance, phase, off_axis, exposure, shared, brightness, derivatives):
     """Brightness of albedo 1 along a row, and its derivatives by c1, c2, v2 and v4.
 
@@ -80,7 +83,7 @@ def brightness_row(reflectance, phase, off_axis, exposure, shared, brightness, d
         derivatives[3, j] = -square * square * brightness[j]
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def weigh_row(
     measured, weight, precision, brightness, haze, albedo, scale, loss, w, top, bottom, spread
 ):
@@ -95,7 +98,7 @@ def weigh_row(
         spread[j] += share * w[j] * brightness[j] * brightness[j]
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def image_sums(brightness, derivatives, w, albedo, residual, level, own, border, gradient, u):
     """Sums of one image along a row before elimination; ``u`` receives w M J per pixel."""
     for j in range(brightness.size):
@@ -113,7 +116,7 @@ def image_sums(brightness, derivatives, w, albedo, residual, level, own, border,
             border[1, g] += wb * albedo[j] * derivatives[g, j]
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def shared_sums(brightness, derivatives, w, albedo, residual, square, gradient, u):
     """Sums of the shared parameters along a row; adds w M J of this image to ``u``."""
     for g in range(SHARED):
@@ -126,7 +129,7 @@ def shared_sums(brightness, derivatives, w, albedo, residual, square, gradient, 
                 square[g, h] += w[j] * albedo[j] ** 2 * derivatives[g, j] * derivatives[h, j]
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def dot3(a, b, c):
     """Sum of a b c over a row."""
     total = 0.0
@@ -135,7 +138,7 @@ def dot3(a, b, c):
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def residual_sums(residual, weight, precision, w, count, scale, loss, scatter, histogram, patches):
     """Cost and squared scores of a row; adds to the scatter per pixel and to the sums per patch.
 

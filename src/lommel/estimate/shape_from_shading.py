@@ -226,11 +226,36 @@ def _descend(level, u, steps, settings, history):
         )
         level.albedo = here.albedo
         if settings.estimate_exposure:
+            u = without_tilt(u, level.initial)
             level.exposures[:] = best_exposures(level.assemble(u)[2], level.exposures)
             here = level.expand(u)
         if step < settings.step_tolerance:
             return u, True
     return u, False
+
+
+def without_tilt(u, initial):
+    """The surface with the mean height and tilt of the initial one.
+
+    An exposure and the tilt of the whole surface towards the Sun do the same to an image: what
+    tells them apart is the initial DEM, whose mean plane is kept.
+
+    Parameters
+    ----------
+    u, initial : float32 array (rows, cols), m
+
+    Returns
+    -------
+    u : float32 array (rows, cols), m
+    """
+    change = u - initial
+    row, col = (np.linspace(-1.0, 1.0, size) for size in change.shape)
+    by_row, by_col = change.mean(axis=1, dtype=float), change.mean(axis=0, dtype=float)
+    rise_row = (row @ by_row) / (row @ row)
+    rise_col = (col @ by_col) / (col @ col)
+    mean = by_row.mean()
+    plane = (mean + rise_row * row)[:, None] + (rise_col * col)[None, :]
+    return u - plane.astype(np.float32)
 
 
 def _look(level, u):
