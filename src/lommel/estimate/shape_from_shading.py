@@ -210,28 +210,33 @@ def _descend(level, u, steps, settings, history):
             length /= 2
             u = start + np.float32(length) * linear.x
             here = _look(level, u)
-        step = float(length * np.sqrt(dot(linear.x, linear.x) / linear.x.size))
         if not here.cost <= last * (1 + ROUNDING):  # no way down: stay
             _look(level, start)
-            return start, step < settings.step_tolerance
+            return start, length * _rms(linear.x) < settings.step_tolerance
+        level.albedo = here.albedo
+        cost = here.cost
+        if settings.estimate_exposure:
+            u = without_tilt(u, level.initial)
+            level.exposures[:] = best_exposures(level.assemble(u)[2], level.exposures)
+            here = level.expand(u)
+        step = _rms(u - start)
         history.append(
             {
                 "stride": level.stride,
-                "cost": here.cost,
+                "cost": cost,
                 "step_m": step,
                 "cycles": linear.iterations,
                 "reduction": linear.reduction,
                 "length": length,
             }
         )
-        level.albedo = here.albedo
-        if settings.estimate_exposure:
-            u = without_tilt(u, level.initial)
-            level.exposures[:] = best_exposures(level.assemble(u)[2], level.exposures)
-            here = level.expand(u)
         if step < settings.step_tolerance:
             return u, True
     return u, False
+
+
+def _rms(change):
+    return float(np.sqrt(dot(change, change) / change.size))
 
 
 def without_tilt(u, initial):
