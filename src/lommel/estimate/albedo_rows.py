@@ -12,14 +12,8 @@ LEAST_SQUARES, HUBER, CAUCHY = 0, 1, 2
 HUBER_TUNING, CAUCHY_TUNING = 1.345, 2.385  # 95 % efficient on Gaussian noise (Holland & Welsch)
 LOSSES = {"least-squares": LEAST_SQUARES, "huber": HUBER, "cauchy": CAUCHY}
 
-# For functions that only compiled code calls: a third less time to compile. Sums may be reordered,
-# so that they become vector instructions; the order is the same in every run.
-inner = njit(
-    error_model="numpy",
-    fastmath={"contract", "nsz", "reassoc"},
-    no_cpython_wrapper=True,
-    no_cfunc_wrapper=True,
-)
+# for functions that only compiled code calls: a third less time to compile
+inner = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 @inner
