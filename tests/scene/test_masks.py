@@ -77,10 +77,18 @@ def test_feathering_ends_with_the_valid_pixels():
 
 
 def test_each_reason_to_leave_a_pixel_out_gives_weight_zero():
-    measured = np.array([[100.0, np.nan, 3.0, 254.0, 100.0, 100.0, 100.0, 100.0]], np.float32)
-    cos_incidence = np.array([[0.5, 0.5, 0.5, 0.5, 0.01, 0.5, np.nan, 0.5]])
-    cos_emission = np.array([[0.9, 0.9, 0.9, 0.9, 0.9, 0.1, 0.9, 0.9]])
+    measured = np.full((1, 12), 100.0, np.float32)
+    measured[0, [2, 5, 8]] = np.nan, 3.0, 254.0
+    cos_incidence, cos_emission = np.full((2, 1, 12), 0.7)
+    cos_incidence[0, [10]] = 0.01
+    cos_emission[0, [11]] = np.nan
     weights = pixel_weights(measured, cos_incidence, cos_emission, 5.0, 255.0, MaskSettings())
-    np.testing.assert_array_equal(
-        weights[0] > 0, [True, False, False, False, False, False, False, True]
-    )
+    assert np.flatnonzero(weights[0]).tolist() == [0]
+
+
+def test_neighbours_of_dark_pixels_are_left_out_and_no_others():
+    measured = np.full((7, 7), 100.0, np.float32)
+    measured[3, 3] = 1.0
+    angles = np.full((7, 7), 0.7)
+    weights = pixel_weights(measured, angles, angles, 5.0, 255.0, MaskSettings())
+    assert (weights == 0).sum() == 5

@@ -43,8 +43,8 @@ class SolverSettings:
     ----------
     max_steps : int
         Gauss-Newton steps on the finest grid.
-    step_tolerance : float, m
-        Root mean square step that counts as converged.
+    step_tolerance : float, dimensionless
+        Step that counts as converged, as a share of the whole change so far (rms).
     cycle_tolerance : float
         Reduction of the linear residual per Gauss-Newton step.
     max_cycles : int
@@ -56,7 +56,7 @@ class SolverSettings:
     """
 
     max_steps: int = 8
-    step_tolerance: float = 0.01
+    step_tolerance: float = 0.005
     cycle_tolerance: float = 0.03
     max_cycles: int = 40
     estimate_exposure: bool = True
@@ -212,7 +212,7 @@ def _descend(level, u, steps, settings, history):
             here = _look(level, u)
         if not here.cost <= last * (1 + ROUNDING):  # no way down: stay
             _look(level, start)
-            return start, length * _rms(linear.x) < settings.step_tolerance
+            return start, _is_small(np.float32(length) * linear.x, start, level, settings)
         level.albedo = here.albedo
         cost = here.cost
         if settings.estimate_exposure:
@@ -230,9 +230,13 @@ def _descend(level, u, steps, settings, history):
                 "length": length,
             }
         )
-        if step < settings.step_tolerance:
+        if _is_small(u - start, u, level, settings):
             return u, True
     return u, False
+
+
+def _is_small(step, u, level, settings):
+    return _rms(step) < settings.step_tolerance * _rms(u - level.initial)
 
 
 def _rms(change):

@@ -26,10 +26,9 @@ from lommel.run.inputs import (
 from lommel.scene.body import MOON
 from lommel.scene.camera import ReducedCamera
 from lommel.scene.grid import Grid, bounds_in, grid_from_bounds, read_crs
-from lommel.scene.masks import CLIPPED, MaskSettings, shadow_thresholds
+from lommel.scene.masks import CLIPPED, MARGIN, MaskSettings, shadow_thresholds
 from lommel.scene.view import CameraView, OrthoView
 
-MARGIN = 1  # pixels beside unusable ones that are left out: they hold part of them
 LEAST_SHARED = 8  # rows and columns of posts; a thinner sliver of an image tells no slope apart
 LEAST_LIT = 0.01  # share of an image's pixels that must be lit and unclipped for it to be used
 

@@ -6,7 +6,9 @@ The mask is the S of the albedo paper, the feathering its w. Most callers want `
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import binary_erosion
 
+MARGIN = 1  # pixels beside unusable ones that are left out
 CLIPPED = 0.98  # of the saturation value; interpolation lowers clipped pixels by this much
 HISTOGRAM_BINS = 40  # from black to the brightness of lit ground
 VALLEY_LIMIT = 0.35  # of the lit brightness: shadow ends below it, even on ground facing away
@@ -159,6 +161,8 @@ def pixel_weights(measured, cos_incidence, cos_emission, threshold, saturation, 
     """
     has_value = np.isfinite(measured)
     usable = has_value & (measured > threshold) & (measured < CLIPPED * saturation)
+    # pixels beside shadow, clipping or no data hold part of it
+    usable = binary_erosion(usable, iterations=MARGIN, border_value=1)
     usable &= cos_incidence > np.cos(settings.max_incidence)
     usable &= cos_emission > np.cos(settings.max_emission)
     return np.where(usable, feathering(measured.shape, has_value), np.float32(0.0))
