@@ -31,7 +31,8 @@ COARSEST = 24  # posts along the shorter side of the coarsest level that sees th
 COARSE_STEPS = 2  # Gauss-Newton steps per coarse level
 SHORTEST_STEP = 0.1  # of a Gauss-Newton step: the cost that still rises has no way down
 ROUNDING = 1e-5  # relative, of a cost summed from float32 residuals
-POOR_FIT = 5.0  # noise standard errors, rms: more is not noise
+POOR_FIT = 2.5  # noise standard errors, rms: more is not noise
+POOR_START = 0.25  # of the brightness taken for noise: the initial DEM explains nothing
 ODD_IMAGE = 1.5  # times the median of the others, which a false image spoils as well
 
 
@@ -149,7 +150,9 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
         priors,
     )
     names = [view.name for view in views]
-    return Solution(value, *_outcome(converged, history, misfits, names), history)
+    noise = np.median([n / np.nanmean(i) for n, i in zip(priors.noise, finest.cells, strict=True)])
+    outcome, advice = _outcome(converged, history, misfits, noise, names)
+    return Solution(value, outcome, advice, history)
 
 
 def separation(level, u):
@@ -295,7 +298,7 @@ def _estimate_priors(level):
     return estimate_priors(level.cells, residuals, gains, level.surface.grid.spacing, respond)
 
 
-def _outcome(converged, history, misfits, names):
+def _outcome(converged, history, misfits, noise, names):
     """Name and sentence of how the solve ended."""
     step = history[-1]["step_m"] if history else 0.0
     worst = int(np.argmax(misfits))
@@ -310,6 +313,11 @@ def _outcome(converged, history, misfits, names):
         return "poor_fit", (
             f"The modelled images differ from the measured ones by {others:.1f} noise standard "
             "errors: the DEM may be too far off, or cameras and Sun wrong. Do not use the result."
+        )
+    if noise > POOR_START:
+        return "poor_start", (
+            f"The initial DEM leaves {100 * noise:.0f} % of the images' brightness unexplained, so "
+            "nothing could be learnt from it. Check that DEM, images and positions belong together."
         )
     if converged:
         return "converged", f"Converged: the last step moved the surface by {step:.3g} m."
