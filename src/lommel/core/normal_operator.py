@@ -161,36 +161,47 @@ def apply_operator(u, gpp, gpq, gqq, curvature, hourglass, mass, out):
 def inverse_diagonal(gpp, gpq, gqq, curvature, hourglass, mass, out):
     """``out = 1 / diag(A)``; arguments as in `apply_operator`."""
     rows, cols = out.shape
+    along = np.zeros(cols, np.float32)
+    weights = np.zeros(5, np.float32)
+    for c in range(cols):
+        _column_weights(c, cols, weights)
+        along[c] = curvature[0] * weights[2]
     for i in prange(rows):
         r = np.int64(i)
         weights = np.zeros(5, np.float32)
         _column_weights(r, rows, weights)
-        row = out[r]
-        row[:] = mass[min(r, mass.shape[0] - 1)] + curvature[2] * weights[2]
-        _column_diagonal(row, curvature[0])
+        across = curvature[2] * weights[2]
+        _fill_row(mass[min(r, mass.shape[0] - 1)], along, across, out[r])
         if r < rows - 1:
-            _cell_diagonal(gpp[r], gpq[r], gqq[r], 1.0, curvature[1], hourglass, row)
+            _cell_diagonal(gpp[r], gpq[r], gqq[r], 1.0, curvature[1], hourglass, out[r])
         if r > 0:
-            _cell_diagonal(gpp[r - 1], gpq[r - 1], gqq[r - 1], -1.0, curvature[1], hourglass, row)
-        for c in range(cols):
-            row[c] = np.float32(1.0) / max(row[c], np.float32(1e-30))
+            _cell_diagonal(
+                gpp[r - 1], gpq[r - 1], gqq[r - 1], -1.0, curvature[1], hourglass, out[r]
+            )
+        _invert_row(out[r])
 
 
-@njit(cache=True, nogil=True)
-def _column_diagonal(row, wxx):
-    weights = np.zeros(5, np.float32)
+@njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
+def _fill_row(mass, along, across, row):
     for c in range(row.size):
-        _column_weights(c, row.size, weights)
-        row[c] += wxx * weights[2]
+        row[c] = mass[c] + along[c] + across
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
+def _invert_row(row):
+    for c in range(row.size):
+        row[c] = np.float32(1.0) / max(row[c], np.float32(1e-30))
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
 def _cell_diagonal(gpp, gpq, gqq, sign, twist, hourglass, row):
+    quarter, mixed = np.float32(0.25), np.float32(0.5 * sign)
     for c in range(gpp.size):
         trace = gpp[c] + gqq[c]
-        bend = twist + hourglass * trace
-        row[c] += 0.25 * (trace + 2.0 * sign * gpq[c]) + bend
-        row[c + 1] += 0.25 * (trace - 2.0 * sign * gpq[c]) + bend
+        row[c] += quarter * trace + mixed * gpq[c] + (twist + hourglass * trace)
+    for c in range(gpp.size):
+        trace = gpp[c] + gqq[c]
+        row[c + 1] += quarter * trace - mixed * gpq[c] + (twist + hourglass * trace)
 
 
 @njit(cache=True, parallel=True)
@@ -279,16 +290,25 @@ def restrict(fine, coarse):
         _halve_row(line, coarse[r])
 
 
+@njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
+def _add_interleaved(near, far, row):
+    """Add the mean of two coarse rows, interpolated to every second column."""
+    half, quarter = np.float32(0.5), np.float32(0.25)
+    here = near[0] + far[0]
+    for c in range(row.size // 2):
+        ahead = near[c + 1] + far[c + 1]
+        row[2 * c] += half * here
+        row[2 * c + 1] += quarter * (here + ahead)
+        here = ahead
+    if row.size % 2:
+        row[row.size - 1] += half * here
+
+
 @njit(cache=True, parallel=True)
 def prolong_add(coarse, fine):
     """Add the bilinear interpolation of coarse posts to the fine ones."""
-    cols = fine.shape[1]
-    half = np.float32(0.5)
     for i in prange(fine.shape[0]):
         r = np.int64(i)
         near, far = coarse[r // 2], coarse[(r + 1) // 2]
         row = fine[r]
-        for c in range((cols + 1) // 2):
-            row[2 * c] += half * (near[c] + far[c])
-        for c in range(cols // 2):
-            row[2 * c + 1] += half * half * ((near[c] + far[c]) + (near[c + 1] + far[c + 1]))
+        _add_interleaved(near, far, row)

@@ -19,7 +19,7 @@ import numpy as np
 
 from lommel.errors import InputError
 
-TILE = 1024  # cells along each side of the part that is analysed
+TILE = 512  # cells along each side of the part that is analysed
 FIT_STEPS = 30  # of the multiplicative update; 10 settle it to 1 %
 LEAST_NOISE = 1e-3  # share of the mean brightness: no imager's photometry is better
 ROUGHNESS_OCTAVES = slice(1, 4)  # the shortest octave is dulled by the pixels' own size

@@ -46,6 +46,8 @@ class SolverSettings:
         Gauss-Newton steps on the finest grid.
     step_tolerance : float, dimensionless
         Step that counts as converged, as a share of the whole change so far (rms).
+    gain_tolerance : float, dimensionless
+        Expected fall of the cost in one step, as a share of it, that counts as converged.
     cycle_tolerance : float
         Reduction of the linear residual per Gauss-Newton step.
     max_cycles : int
@@ -58,7 +60,8 @@ class SolverSettings:
 
     max_steps: int = 8
     step_tolerance: float = 0.005
-    cycle_tolerance: float = 0.03
+    gain_tolerance: float = 1e-3
+    cycle_tolerance: float = 0.1
     max_cycles: int = 40
     estimate_exposure: bool = True
     estimate_albedo: bool = True
@@ -207,6 +210,7 @@ def _descend(level, u, steps, settings, history):
             equations, -here.gradient, settings.cycle_tolerance, settings.max_cycles
         )
         length, last = 1.0, here.cost
+        gain = -dot(here.gradient, linear.x) / 2
         u, start = u + linear.x, u
         here = _look(level, u)
         while not here.cost <= last and length > SHORTEST_STEP:
@@ -233,7 +237,7 @@ def _descend(level, u, steps, settings, history):
                 "length": length,
             }
         )
-        if _is_small(u - start, u, level, settings):
+        if gain < settings.gain_tolerance * cost or _is_small(u - start, u, level, settings):
             return u, True
     return u, False
 
