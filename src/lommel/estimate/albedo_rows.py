@@ -12,8 +12,11 @@ LEAST_SQUARES, HUBER, CAUCHY = 0, 1, 2
 HUBER_TUNING, CAUCHY_TUNING = 1.345, 2.385  # 95 % efficient on Gaussian noise (Holland & Welsch)
 LOSSES = {"least-squares": LEAST_SQUARES, "huber": HUBER, "cauchy": CAUCHY}
 
-# for functions that only compiled code calls: a third less time to compile
-inner = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+# For functions that only compiled code calls: a third less time to compile. The type stubs of
+# Numba do not know these two options.
+inner = njit(  # type: ignore[call-overload]
+    error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True
+)
 
 
 @inner
