@@ -30,7 +30,8 @@ check: $(STAMP)  ## lint, formatting, types, and who may import whom
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-docs: $(STAMP)  ## run the examples in README and docs
+docs: demo  ## draw the README's pictures from the demo, run the examples in README and docs
+	$(BIN)/python docs/pictures.py demo
 	$(BIN)/python -m pytest $(PYTEST_ARGS) README.md docs
 
 bench: $(STAMP)  ## measure time, memory and accuracy of the solvers
