@@ -175,6 +175,7 @@ def sfs(
     estimate_exposure: Annotated[
         bool, typer.Option(help="Re-estimate the exposures with the surface.")
     ] = True,
+    estimate_haze: Annotated[bool, typer.Option(help="Also estimate an offset per image.")] = False,
     estimate_albedo: Annotated[
         bool, typer.Option(help="Give albedo what shading cannot explain; otherwise it is 1.")
     ] = True,
@@ -204,6 +205,7 @@ def sfs(
         solver=SolverSettings(
             max_steps=max_steps,
             estimate_exposure=estimate_exposure,
+            estimate_haze=estimate_haze,
             estimate_albedo=estimate_albedo,
         ),
         masks=MaskSettings(shadow_threshold=shadow_threshold),

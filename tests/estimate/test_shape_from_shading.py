@@ -246,3 +246,21 @@ def test_albedo_is_recovered_under_three_suns():
     on_cells = (albedo[1:, 1:] + albedo[1:, :-1] + albedo[:-1, 1:] + albedo[:-1, :-1]) / 4
     match = np.corrcoef(solution.value.albedo.ravel(), on_cells.ravel())[0, 1]
     assert match > 0.98
+
+
+def test_haze_is_found_when_asked_for():
+    truth, initial = rough_scene(seed=21)
+    grid = patch_grid(*truth.shape)
+    views = simulated_views(truth, grid, (40.0, 160.0, 280.0))
+    views[1] = views[1].with_image(views[1].image + np.float32(6.0))
+    found = {}
+    for asked in (False, True):
+        settings = SolverSettings(estimate_haze=asked)
+        solution = solve_surface(
+            Surface(grid, 0.0), initial, views, reflectance_model(), settings=settings
+        )
+        found[asked] = solution.value.hazes, rms(solution.value.u - truth)
+    assert not found[False][0].any()
+    haze = found[True][0]  # what all images share is the prior's; what they differ by is theirs
+    assert haze[1] - (haze[0] + haze[2]) / 2 == pytest.approx(6.0, abs=0.5)  # image units of 60
+    assert found[True][1] < found[False][1]

@@ -14,8 +14,11 @@ from lommel.core.multigrid import add_long_waves, coarse_masses, dot, threads_fo
 from lommel.core.normal_operator import apply_operator, coarse_shape, restrict, slope_adjoint
 from lommel.estimate.shading_kernels import (
     SUM_COST,
+    SUM_F,
     SUM_FF,
     SUM_FM,
+    SUM_M,
+    SUM_W,
     assemble,
     cast_shadow,
     cosines,
@@ -26,6 +29,7 @@ from lommel.estimate.shading_kernels import (
 from lommel.scene.geometry import unit
 
 SLOPE_STEP = 0.01  # for the change of brightness with slope: R bends little over half a degree
+HAZE_ERROR = 0.1  # of the mean brightness: scattered light and film base are not more
 LOWEST_SUN = 0.01  # sine of the elevation below which shadows are not followed any longer
 DARK = 0.5  # of the median brightness: the image itself denies a shadow that is brighter
 HUBER_SCALE = 3.0  # noise standard errors from which a residual counts as an outlier
@@ -344,7 +348,29 @@ def coarse_posts(posts):
     return total / weight
 
 
-def best_exposures(sums, exposures):
-    """Exposures that fit the images best, from the sums of `Problem.assemble`."""
-    has_data = sums[:, SUM_FF] > 0
-    return np.where(has_data, sums[:, SUM_FM] / np.where(has_data, sums[:, SUM_FF], 1), exposures)
+def best_photometry(sums, exposures, hazes, estimate_haze):
+    """Exposures, and hazes if asked for, that fit the images best.
+
+    Parameters
+    ----------
+    sums : float64 array (images, 8)
+        Of `Problem.assemble`.
+    exposures, hazes : array (images,)
+        As they are; kept where an image has no data.
+    estimate_haze : bool
+        With an expectation of 0 and a standard error of `HAZE_ERROR` of the mean brightness.
+
+    Returns
+    -------
+    exposures, hazes : array (images,)
+    """
+    w, f, ff, fm, m = (sums[:, column] for column in (SUM_W, SUM_F, SUM_FF, SUM_FM, SUM_M))
+    has_data = (ff > 0) & (m > 0)
+    if not estimate_haze:
+        best = (fm - hazes * f) / np.where(has_data, ff, 1)
+        return np.where(has_data, best, exposures), hazes
+    pull = (w / np.where(has_data, HAZE_ERROR * m, 1)) ** 2
+    determinant = np.where(has_data, ff * (w + pull) - f**2, 1)
+    haze = (ff * m - f * fm) / determinant
+    exposure = (fm * (w + pull) - f * m) / determinant
+    return np.where(has_data, exposure, exposures), np.where(has_data, haze, hazes)

@@ -24,7 +24,7 @@ from lommel.core.multigrid import NormalEquations, conjugate_gradients, dot
 from lommel.core.normal_operator import prolong_add
 from lommel.estimate.albedo_field import fit_albedo
 from lommel.estimate.priors import Priors, PriorSettings, estimate_priors
-from lommel.estimate.problem import best_exposures, fresh_problem
+from lommel.estimate.problem import best_photometry, fresh_problem
 from lommel.estimate.shading_kernels import SUM_COUNT, SUM_RR
 
 COARSEST = 24  # posts along the shorter side of the coarsest level that sees the images
@@ -54,6 +54,8 @@ class SolverSettings:
         V-cycles per Gauss-Newton step.
     estimate_exposure : bool
         Re-estimate the exposures after each step.
+    estimate_haze : bool
+        And an offset per image, expected to be small.
     estimate_albedo : bool
         Give albedo what the images show beyond shading; otherwise it stays 1, or as given.
     """
@@ -64,6 +66,7 @@ class SolverSettings:
     cycle_tolerance: float = 0.1
     max_cycles: int = 40
     estimate_exposure: bool = True
+    estimate_haze: bool = False
     estimate_albedo: bool = True
 
 
@@ -127,7 +130,8 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
     finest.prepare_geometry(finest.initial)
     finest.sample_images(finest.initial)
     finest.find_shadows(finest.initial)
-    finest.exposures[:] = best_exposures(finest.assemble(finest.initial)[2], finest.exposures)
+    # a blurred DEM explains part of the contrast only: haze would seem to explain the rest
+    _fit_photometry(finest, finest.initial, replace(settings, estimate_haze=False))
     if not isinstance(priors, Priors):
         spacing = (surface.grid.spacing[0] * surface.grid.spacing[1]) ** 0.5
         priors = (priors or PriorSettings()).applied_to(_estimate_priors(finest), spacing)
@@ -136,7 +140,7 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
     history: list[dict] = []
     u, converged = _coarse_to_fine(finest, settings, history)
     if settings.estimate_albedo:
-        _fit_albedo(finest, u, priors)
+        _fit_albedo(finest, u, priors, settings)
     modelled = [finest.predict(u, k) for k in range(len(views))]
     sums = finest.assemble(u)[2]
     misfits = np.sqrt(sums[:, SUM_RR] / np.maximum(sums[:, SUM_COUNT], 1))
@@ -191,7 +195,7 @@ def _coarse_to_fine(finest, settings, history):
             coarse = levels.pop()
             correction, u = u - coarse.initial, level.initial.copy()
             prolong_add(correction, u)
-            level.exposures[:] = coarse.exposures
+            level.exposures, level.hazes = coarse.exposures, coarse.hazes
         if level is finest:
             level.prepare_geometry(u)
             level.sample_images(u)
@@ -224,7 +228,7 @@ def _descend(level, u, steps, settings, history):
         cost = here.cost
         if settings.estimate_exposure:
             u = without_tilt(u, level.initial)
-            level.exposures[:] = best_exposures(level.assemble(u)[2], level.exposures)
+            _fit_photometry(level, u, settings)
             here = level.expand(u)
         step = _rms(u - start)
         history.append(
@@ -281,13 +285,25 @@ def _look(level, u):
     return level.expand(u)
 
 
-def _fit_albedo(level, u, priors):
-    """Albedo of the cells, given the surface; the exposures keep its mean at 1."""
-    shading = [level.predict(u, k) / level.albedo for k in range(len(level.views))]
-    level.albedo = fit_albedo(
-        shading, level.cells, priors.noise, priors.albedo_contrast, level.albedo
+def _fit_photometry(level, u, settings):
+    sums = level.assemble(u)[2]
+    level.exposures, level.hazes = best_photometry(
+        sums, level.exposures, level.hazes, settings.estimate_haze
     )
-    level.exposures[:] = best_exposures(level.assemble(u)[2], level.exposures)
+
+
+def _fit_albedo(level, u, priors, settings):
+    """Albedo of the cells, given the surface; the exposures keep its mean at 1."""
+    images = range(len(level.views))
+    shading = [(level.predict(u, k) - level.hazes[k]) / level.albedo for k in images]
+    level.albedo = fit_albedo(
+        shading,
+        [c - haze for c, haze in zip(level.cells, level.hazes, strict=True)],
+        priors.noise,
+        priors.albedo_contrast,
+        level.albedo,
+    )
+    _fit_photometry(level, u, settings)
 
 
 def _estimate_priors(level):
