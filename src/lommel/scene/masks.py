@@ -128,7 +128,7 @@ def feathering(shape, valid=None):
 
     Examples
     --------
-    >>> feathering((1, 5))[0].round(1).tolist()
+    >>> [round(float(weight), 1) for weight in feathering((1, 5))[0]]
     [0.2, 0.6, 1.0, 0.6, 0.2]
     """
     along = []
