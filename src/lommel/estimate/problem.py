@@ -12,6 +12,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter
 
 from lommel.core.multigrid import add_long_waves, coarse_masses, dot, threads_for
 from lommel.core.normal_operator import apply_operator, coarse_shape, restrict, slope_adjoint
+from lommel.core.reflectance import reflectance_model
 from lommel.estimate.shading_kernels import (
     SUM_COST,
     SUM_F,
@@ -311,6 +312,30 @@ def light_planes(frame, view, model):
     planes = [np.einsum("...i,...i", frame.c[k], to_sun) for k in range(3)]
     planes += [np.einsum("...i,...i", frame.c[k], to_camera) for k in range(3)]
     return np.stack([*planes, share, factor]).astype(np.float32)
+
+
+def cos_incidence(surface, u, view):
+    """Cosine of incidence on the cells of a surface, under the Sun of a view.
+
+    Parameters
+    ----------
+    surface : Surface
+    u : float32 array (rows, cols), m
+    view : OrthoView or CameraView
+
+    Returns
+    -------
+    cosine : float32 array (rows - 1, cols - 1), dimensionless; negative where turned away
+    """
+    distance = np.linalg.norm(view.position) - surface.grid.body.radius
+    lattice = surface.lattice(u.shape, 1, distance)
+    frame = surface.frame(lattice, lattice_heights(u, lattice))
+    light = light_planes(frame, view, reflectance_model("lambert"))
+    planes = np.empty((4, u.shape[0] - 1, u.shape[1] - 1), np.float32)
+    spacing = np.array(surface.grid.spacing, np.float32)
+    with threads_for(u.shape):
+        cosines(u, frame.gram.astype(np.float32), light, lattice.step, spacing, planes)
+    return planes[0]
 
 
 def lattice_heights(u, lattice):

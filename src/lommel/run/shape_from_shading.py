@@ -13,13 +13,13 @@ from lommel.core.reflectance import reflectance_model
 from lommel.errors import InputError
 from lommel.estimate.holes import fill_holes
 from lommel.estimate.priors import PriorSettings
+from lommel.estimate.problem import cos_incidence
 from lommel.estimate.shape_from_shading import SolverSettings, solve_surface
 from lommel.estimate.surface import Surface
 from lommel.io.raster import write_raster
 from lommel.run.inputs import GridSettings, SceneFiles
 from lommel.run.products import RunRecord, output_folder
 from lommel.run.views import read_views
-from lommel.scene.geometry import surface_normals, viewing_geometry
 from lommel.scene.grid import Grid
 from lommel.scene.masks import MaskSettings
 
@@ -139,7 +139,7 @@ def _write_products(folder, scene, initial, refined, surface):
     write_raster(folder / "initial-dem.tif", scene.heights, grid, "height", "m")
     for name, heights in (("before", initial), ("after", refined)):
         shade = hillshade(grid, heights, scene.views[0])
-        write_raster(folder / f"hillshade-{name}.tif", shade, grid, "cosine of incidence", "1")
+        write_raster(folder / f"hillshade-{name}.tif", shade, cells, "cosine of incidence", "1")
     write_raster(folder / "measured.tif", surface.measured[0], cells, "measured brightness")
     modelled = np.where(np.isfinite(surface.measured[0]), surface.modelled[0], np.nan)
     write_raster(folder / "modelled.tif", modelled, cells, "modelled brightness")
@@ -162,16 +162,16 @@ def hillshade(grid, heights, view):
     Parameters
     ----------
     grid : Grid
-    heights : array (rows, cols), m
+    heights : float32 array (rows, cols), m
     view : OrthoView or CameraView
 
     Returns
     -------
-    shade : array (rows, cols), dimensionless
+    shade : float32 array (rows - 1, cols - 1), dimensionless
     """
-    xyz = grid.xyz(heights)
-    geometry = viewing_geometry(xyz, surface_normals(xyz), view.sun_position, view.position)
-    return np.clip(geometry.cos_incidence, 0.0, None)
+    surface = Surface(grid, float(np.nanmean(heights, dtype=float)))
+    u = surface.posts_from_heights(heights)
+    return np.maximum(cos_incidence(surface, u, view), np.float32(0))
 
 
 def relative_residual(surface):
@@ -183,15 +183,16 @@ def relative_residual(surface):
 
     Returns
     -------
-    residual : float array (rows - 1, cols - 1), per cent; NaN where no image counts
+    residual : float32 array (rows - 1, cols - 1), per cent; NaN where no image counts
     """
-    total = np.zeros(surface.measured[0].shape)
-    count = np.zeros_like(total)
+    total = np.zeros_like(surface.measured[0])
+    count = np.zeros(total.shape, np.uint16)
     for measured, modelled in zip(surface.measured, surface.modelled, strict=True):
-        difference = (modelled - measured) / np.nanmedian(measured)
-        total += np.nan_to_num(difference) ** 2
-        count += np.isfinite(difference)
-    return 100 * np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+        difference = (modelled - measured) * np.float32(100 / np.nanmedian(measured[::4, ::4]))
+        known = np.isfinite(difference)
+        total[known] += difference[known] ** 2
+        count += known
+    return np.sqrt(total / np.where(count > 0, count, np.nan).astype(np.float32))
 
 
 def correlation(measured, modelled):

@@ -23,13 +23,14 @@ from lommel.run.inputs import (
     refuse_duplicates,
     refuse_unusable,
 )
-from lommel.scene.body import MOON
+from lommel.scene.body import MOON, to_xyz
 from lommel.scene.camera import ReducedCamera
 from lommel.scene.grid import Grid, bounds_in, grid_from_bounds, read_crs
 from lommel.scene.masks import CLIPPED, MARGIN, MaskSettings, shadow_thresholds
 from lommel.scene.view import CameraView, OrthoView
 
 LEAST_SHARED = 8  # rows and columns of posts; a thinner sliver of an image tells no slope apart
+SIGHTS = 65  # posts along each side that are tried to see whether a camera sees the DEM
 LEAST_LIT = 0.01  # share of an image's pixels that must be lit and unclipped for it to be used
 
 
@@ -209,13 +210,18 @@ def ground_sample_distance(camera, grid, height):
 def _camera_view(path, camera_path, suns, files, grid, heights, body):
     image = read_pixels(path)
     camera = read_camera(camera_path, image.shape)
-    line, sample = camera.project(grid.xyz(float(np.nanmean(heights)))[::8, ::8])
+    height = float(np.nanmean(heights, dtype=float))
+    posts = (
+        np.linspace(0, grid.shape[0] - 1, SIGHTS)[:, None],
+        np.linspace(0, grid.shape[1] - 1, SIGHTS),
+    )
+    line, sample = camera.project(to_xyz(body, *grid.lonlat_at(*posts), height))
     if not camera.contains(line, sample).any():
         raise GeometryError(
             f"{path.name}: its camera does not see the DEM. Check that camera and DEM belong to "
             "the same place, and the units of the camera file (metres)."
         )
-    gsd = ground_sample_distance(camera, grid, float(np.nanmean(heights)))
+    gsd = ground_sample_distance(camera, grid, height)
     factor = int(min(grid.spacing) / gsd + 0.5) if np.isfinite(gsd) else 1
     if factor > 1:  # finer pixels than posts: their means are what the cells can explain
         image, camera = _reduce(image, factor), ReducedCamera(camera, factor)
