@@ -342,6 +342,7 @@ def _write_cog(path, values, grid, texts, nodata, valid):
                 driver="COG",
                 compress="deflate",
                 predictor="yes",
+                level=1,  # a third less time than the default for 2 % more bytes
                 overview_resampling="average",
                 num_threads=2,
             )

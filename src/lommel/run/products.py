@@ -6,6 +6,7 @@ stage is done, and is removed when it fails. Most callers want `output_folder` a
 
 import hashlib
 import json
+import math
 import os
 import platform
 import resource
@@ -20,6 +21,7 @@ from pathlib import Path
 from lommel import __version__
 from lommel.errors import InputError, LommelError
 
+ANGLES = ("max_incidence", "max_emission", "terrain_roughness")  # settings in rad
 PACKAGES = ("numpy", "numba", "scipy", "rasterio", "pyproj")
 
 
@@ -157,12 +159,26 @@ class RunRecord:
             "lommel": __version__,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
             **asdict(self),
+            "settings": _in_degrees(self.settings),
             "versions": {name: _version(name) for name in PACKAGES},
             "machine": _machine(),
         }
         known = json.loads(json.dumps(content, default=_plain), parse_constant=lambda _: None)
         text = json.dumps(known, indent=1, allow_nan=False)
         (Path(folder) / "run.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _in_degrees(settings):
+    """Settings as people read them: angles in degrees, with the unit in the name."""
+    shown = {}
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            shown[name] = _in_degrees(value)
+        elif name in ANGLES and value is not None:
+            shown[f"{name}_deg"] = round(math.degrees(value), 6)
+        else:
+            shown[name] = value
+    return shown
 
 
 def _digest(path):
