@@ -29,8 +29,12 @@ LEAST_CONTRAST = 0.002
 KNOWN_SHARE = 0.85  # of the terrain's power: the DEM knows the octaves in which it errs by less
 LEAST_DIVERSITY = 0.1  # below it images under nearly one Sun cannot tell albedo from slope
 ALBEDO_ERROR = 0.3  # of a cell's albedo about 1, rms: mare against highland
-# Craters bend more light than random relief of the same spectrum: up to this factor
-BEND_MARGIN = 8.0
+# Averages over 2^l posts let through waves half as long, in which the DEM errs more: without this
+# factor on its errors it holds more than it knows.
+LEAK = 2.0
+# Craters bend more light than random relief of the same spectrum: long waves up to this factor,
+# short ones, where single craters count less, this much.
+BEND_MARGIN, NOISE_BEND = 8.0, 2.0
 
 
 @dataclass(frozen=True)
@@ -162,7 +166,7 @@ def estimate_priors(cells, residuals, gains, spacing, respond):
     observed = np.stack([spectra.noise for spectra in error])
     bend = _bend_spectra(relief, gains, spacing, respond, cells[0].shape)
     # resampling dulls the noise of the shortest octave, so the next one tells its level
-    noise = np.sqrt(np.maximum(observed[:, 1] - bend[:, 1], observed[:, 0]))
+    noise = np.sqrt(np.maximum(observed[:, 1] - NOISE_BEND * bend[:, 1], observed[:, 0]))
     noise = np.maximum(noise, LEAST_NOISE * brightness)
     excess = np.maximum(observed - BEND_MARGIN * bend - noise[:, None] ** 2, 0.0)
     contrasts = np.median(np.sqrt(excess) * k / brightness[:, None], axis=0)
@@ -291,7 +295,7 @@ def _dem_errors(precision, first):
     for level in range(first, precision.size):
         lacking = precision[level] - held
         if lacking > 0:
-            errors[level] = 1 / np.sqrt(lacking * 4.0**level)
+            errors[level] = LEAK / np.sqrt(lacking * 4.0**level)
             held = precision[level]
     return errors
 
