@@ -7,9 +7,9 @@ only: with :math:`S_l` the normalised restriction repeated `l` times,
 
 Coarse levels carry the 2x2 mean of the tensors, a quarter of the curvature weight and four times
 the mass per level (the same energy for the same smooth surface), and resist the twist that
-coarse slopes cannot see by tr(G)/12. The smoother is a Chebyshev polynomial on the upper part of
-the spectrum, whose end is known (`LARGEST_EIGENVALUE`). Most callers want `NormalEquations` and
-`conjugate_gradients`.
+coarse slopes cannot see by tr(G)/64. The smoother is a Chebyshev polynomial on the upper part of
+the spectrum, whose end is known (`LARGEST_EIGENVALUE`); its degree doubles from level to level.
+Most callers want `NormalEquations` and `conjugate_gradients`.
 """
 
 from contextlib import contextmanager
@@ -30,9 +30,12 @@ from lommel.core.normal_operator import (
     restrict,
 )
 
-SMOOTHING_STEPS = 3  # degree of the Chebyshev polynomial before and after each coarse visit
-SMOOTHED_SHARE = 1 / 12  # of the spectrum, from its upper end, is left to the coarse level below it
-HOURGLASS = 1 / 12  # share of tr(G): a bilinear cell's energy beyond its centre slopes
+# Degree of the Chebyshev polynomial before and after each coarse visit, doubled from level to
+# level, and the share of the spectrum it leaves to the next one, times the degree squared. With one
+# image stripes along the Sun are nearly free: coarse levels, which cost little, must smooth them.
+DEGREE, LARGEST_DEGREE = 2, 16
+LEFT_SHARE = 0.75
+HOURGLASS = 1 / 64  # share of tr(G): enough against a checkerboard, soft to oblique stripes
 SMALLEST = 5  # posts along the shorter side below which the level is solved directly
 SERIAL_POSTS = 64 * 1024  # below it a parallel loop costs more than it saves
 
@@ -45,6 +48,7 @@ class Level:
     curvature: np.ndarray
     hourglass: float
     mass: np.ndarray
+    degree: int
     inverse_diagonal: np.ndarray
     x: np.ndarray
     residual: np.ndarray
@@ -81,7 +85,7 @@ class NormalEquations:
         self.masses = np.asarray(masses, float)
         posts = np.zeros((1, cols), np.float32) if posts is None else posts
         mass = posts + np.float32(self.masses[0])
-        self.levels = [_level((rows, cols), tensors, curvature, 0.0, mass)]
+        self.levels = [_level((rows, cols), tensors, curvature, 0.0, mass, DEGREE)]
         while min(self.levels[-1].shape) > SMALLEST:
             finer = self.levels[-1]
             shape = coarse_shape(finer.shape)
@@ -97,7 +101,8 @@ class NormalEquations:
             else:
                 posts = np.zeros((1, shape[1]), np.float32)
             mass = posts + np.float32(coarse_masses(self.masses, len(self.levels))[0])
-            self.levels.append(_level(shape, coarse, weights, HOURGLASS, mass))
+            degree = min(2 * finer.degree, LARGEST_DEGREE)
+            self.levels.append(_level(shape, coarse, weights, HOURGLASS, mass, degree))
         self._inverse = _dense_inverse(self.levels[-1])
 
     @property
@@ -286,13 +291,14 @@ def _row_dot(a, b):
     return total
 
 
-def _level(shape, tensors, curvature, hourglass, mass):
+def _level(shape, tensors, curvature, hourglass, mass, degree):
     """Coefficients and work arrays of a grid."""
     level = Level(
         tensors,
         curvature.astype(np.float32),
         np.float32(hourglass),
         mass,
+        degree,
         *(np.zeros(shape, np.float32) for _ in range(5)),
     )
     with threads_for(shape):
@@ -329,14 +335,14 @@ def _dense_inverse(level):
 
 def _smooth(level, starts_at_zero):
     """Chebyshev iteration on the upper spectrum; updates ``x`` and ``residual`` of the level."""
-    upper = LARGEST_EIGENVALUE
-    middle, half = upper * (1 + SMOOTHED_SHARE) / 2, upper * (1 - SMOOTHED_SHARE) / 2
+    upper, left = LARGEST_EIGENVALUE, LEFT_SHARE / level.degree**2
+    middle, half = upper * (1 + left) / 2, upper * (1 - left) / 2
     sigma = middle / half
     rho = 1.0 / sigma
     if starts_at_zero:
         level.x[:] = 0.0
     keep, scale = 0.0, 1.0 / middle
-    for _ in range(SMOOTHING_STEPS):
+    for _ in range(level.degree):
         _chebyshev_direction(
             level.step, level.residual, level.inverse_diagonal, np.float32(keep), np.float32(scale)
         )
