@@ -30,7 +30,8 @@ KNOWN_SHARE = 0.85  # of the terrain's power: the DEM knows the octaves in which
 LEAST_DIVERSITY = 0.1  # below it images under nearly one Sun cannot tell albedo from slope
 ALBEDO_ERROR = 0.3  # of a cell's albedo about 1, rms: mare against highland
 # Averages over 2^l posts let through waves half as long, in which the DEM errs more: without this
-# factor on its errors it holds more than it knows.
+# factor on its errors it holds more than it knows. Under one Sun nothing else holds long waves
+# against albedo, so there the DEM keeps its full weight.
 LEAK = 2.0
 # Craters bend more light than random relief of the same spectrum: long waves up to this factor,
 # short ones, where single craters count less, this much.
@@ -186,7 +187,7 @@ def estimate_priors(cells, residuals, gains, spacing, respond):
         noise=noise,
         roughness=float(level**0.5 / mean_spacing),
         albedo_contrast=contrast,
-        dem_errors=_dem_errors(drowned / relief, first),
+        dem_errors=_dem_errors(drowned / relief, first) * (LEAK if tells_albedo else 1.0),
         smoothing=2.0**first / 2,
         albedo_error=ALBEDO_ERROR if tells_albedo else 0.0,
     )
@@ -295,7 +296,7 @@ def _dem_errors(precision, first):
     for level in range(first, precision.size):
         lacking = precision[level] - held
         if lacking > 0:
-            errors[level] = LEAK / np.sqrt(lacking * 4.0**level)
+            errors[level] = 1 / np.sqrt(lacking * 4.0**level)
             held = precision[level]
     return errors
 
