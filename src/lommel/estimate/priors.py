@@ -29,13 +29,12 @@ LEAST_CONTRAST = 0.002
 KNOWN_SHARE = 0.85  # of the terrain's power: the DEM knows the octaves in which it errs by less
 LEAST_DIVERSITY = 0.1  # below it images under nearly one Sun cannot tell albedo from slope
 ALBEDO_ERROR = 0.3  # of a cell's albedo about 1, rms: mare against highland
-# Averages over 2^l posts let through waves half as long, in which the DEM errs more: without this
-# factor on its errors it holds more than it knows. Under one Sun nothing else holds long waves
-# against albedo, so there the DEM keeps its full weight.
-LEAK = 2.0
-# Craters bend more light than random relief of the same spectrum: long waves up to this factor,
-# short ones, where single craters count less, this much.
-BEND_MARGIN, NOISE_BEND = 8.0, 2.0
+# Averages over 2^l posts let through waves half as long, in which the DEM errs more: without these
+# factors on its errors it holds more than it knows. Under one Sun little else holds long waves
+# against albedo, so there the DEM keeps more of its weight.
+LEAK, LEAK_ONE_SUN = 2.0, 2.0**0.5
+# Craters bend more light than random relief of the same spectrum: up to this factor
+BEND_MARGIN = 8.0
 
 
 @dataclass(frozen=True)
@@ -167,7 +166,7 @@ def estimate_priors(cells, residuals, gains, spacing, respond):
     observed = np.stack([spectra.noise for spectra in error])
     bend = _bend_spectra(relief, gains, spacing, respond, cells[0].shape)
     # resampling dulls the noise of the shortest octave, so the next one tells its level
-    noise = np.sqrt(np.maximum(observed[:, 1] - NOISE_BEND * bend[:, 1], observed[:, 0]))
+    noise = np.sqrt(np.maximum(observed[:, 1] - bend[:, 1], observed[:, 0]))
     noise = np.maximum(noise, LEAST_NOISE * brightness)
     excess = np.maximum(observed - BEND_MARGIN * bend - noise[:, None] ** 2, 0.0)
     contrasts = np.median(np.sqrt(excess) * k / brightness[:, None], axis=0)
@@ -187,7 +186,7 @@ def estimate_priors(cells, residuals, gains, spacing, respond):
         noise=noise,
         roughness=float(level**0.5 / mean_spacing),
         albedo_contrast=contrast,
-        dem_errors=_dem_errors(drowned / relief, first) * (LEAK if tells_albedo else 1.0),
+        dem_errors=_dem_errors(drowned / relief, first) * (LEAK if tells_albedo else LEAK_ONE_SUN),
         smoothing=2.0**first / 2,
         albedo_error=ALBEDO_ERROR if tells_albedo else 0.0,
     )
