@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, zoom
@@ -264,3 +265,21 @@ def test_haze_is_found_when_asked_for():
     haze = found[True][0]  # what all images share is the prior's; what they differ by is theirs
     assert haze[1] - (haze[0] + haze[2]) / 2 == pytest.approx(6.0, abs=0.5)  # image units of 60
     assert found[True][1] < HEIGHT_SHARE * rms(initial - truth)
+
+
+def test_surface_does_not_depend_on_the_number_of_threads():
+    truth, initial = rough_scene(
+        size=280, seed=22
+    )  # large enough for its levels to run in parallel
+    grid = patch_grid(*truth.shape)
+    views = simulated_views(truth, grid, (40.0, 160.0))
+    surface, answers = Surface(grid, 0.0), []
+    threads = numba.get_num_threads()
+    for count in (threads, 1):
+        numba.set_num_threads(count)
+        try:
+            solution = solve_surface(surface, initial, views, reflectance_model())
+        finally:
+            numba.set_num_threads(threads)
+        answers.append(solution.value.u)
+    np.testing.assert_array_equal(*answers)
