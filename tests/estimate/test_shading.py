@@ -8,7 +8,8 @@ from scipy.ndimage import binary_dilation, zoom
 from lommel.core.normal_operator import slope_adjoint
 from lommel.core.reflectance import reflectance_model, user_model
 from lommel.estimate.problem import fresh_problem
-from lommel.estimate.shading_kernels import SUM_COUNT, SUM_FF, SUM_FM, sample_cells
+from lommel.estimate.sampling_kernels import sample_cells
+from lommel.estimate.shading_kernels import SUM_COUNT, SUM_FF, SUM_FM
 from lommel.estimate.surface import Surface
 from lommel.scene.geometry import surface_normals, viewing_geometry
 from lommel.scene.grid import Grid

@@ -13,6 +13,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter
 from lommel.core.multigrid import add_long_waves, coarse_masses, dot, threads_for
 from lommel.core.normal_operator import apply_operator, coarse_shape, restrict, slope_adjoint
 from lommel.core.reflectance import reflectance_model
+from lommel.estimate.sampling_kernels import cast_shadow, sample_cells
 from lommel.estimate.shading_kernels import (
     SUM_COST,
     SUM_F,
@@ -21,11 +22,9 @@ from lommel.estimate.shading_kernels import (
     SUM_M,
     SUM_W,
     assemble,
-    cast_shadow,
     cosines,
     eliminate_albedo,
     predict,
-    sample_cells,
 )
 from lommel.scene.geometry import unit
 

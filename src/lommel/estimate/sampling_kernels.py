@@ -1,0 +1,169 @@
+"""Compiled passes that bring images and light onto the cells of a surface.
+
+`sample_cells` interpolates an image where the surface's points fall in it; `cast_shadow` follows
+the way to the Sun from every cell. Slowly varying geometry comes as planes on a lattice of nodes
+(`lommel.estimate.surface`), interpolated row by row with `expand_row`.
+"""
+
+import numpy as np
+from numba import njit, prange
+
+FAST = {"contract", "nsz"}
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def expand_row(plane, row, step, out):
+    """Interpolate a lattice plane along one row of cells.
+
+    Parameters
+    ----------
+    plane : float32 array (node_rows, node_cols)
+    row : float
+        Of the cells' centres, in node units.
+    step : int
+        Cells from node to node.
+    out : float32 array (cols,)
+    """
+    i = min(np.int64(row), plane.shape[0] - 2)
+    t = np.float32(row - i)
+    upper, lower = plane[i], plane[i + 1]
+    for j in range(plane.shape[1] - 1):
+        first = j * step
+        left = upper[j] + t * (lower[j] - upper[j])
+        right = upper[j + 1] + t * (lower[j + 1] - upper[j + 1])
+        slope = (right - left) / np.float32(step)
+        start = left + np.float32(0.5) * slope
+        part = out[first : min(first + step, out.size)]
+        for c in range(part.size):
+            part[c] = start + slope * np.float32(c)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _cubic_weights(t):
+    """Catmull-Rom weights of four neighbours, at a fraction t behind the second one."""
+    s = np.float32(1.0) - t
+    half = np.float32(0.5)
+    outer_left = -half * t * s * s
+    outer_right = -half * s * t * t
+    inner_right = t * (half + t * (np.float32(2.0) - np.float32(1.5) * t))
+    return (
+        outer_left,
+        np.float32(1.0) - outer_left - outer_right - inner_right,
+        inner_right,
+        outer_right,
+    )
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _sample(image, line, sample):
+    """Cubic interpolation; bilinear beside missing pixels and the border; NaN outside."""
+    lines, samples = image.shape
+    if not (line >= 0 and sample >= 0 and line <= lines - 1 and sample <= samples - 1):
+        return np.float32(np.nan)
+    i = min(np.int64(line), lines - 2)
+    j = min(np.int64(sample), samples - 2)
+    v, h = np.float32(line - i), np.float32(sample - j)
+    if 0 < i < lines - 2 and 0 < j < samples - 2:
+        h0, h1, h2, h3 = _cubic_weights(h)
+        v0, v1, v2, v3 = _cubic_weights(v)
+        a, b, c, d = image[i - 1], image[i], image[i + 1], image[i + 2]
+        value = (
+            v0 * (h0 * a[j - 1] + h1 * a[j] + h2 * a[j + 1] + h3 * a[j + 2])
+            + v1 * (h0 * b[j - 1] + h1 * b[j] + h2 * b[j + 1] + h3 * b[j + 2])
+            + v2 * (h0 * c[j - 1] + h1 * c[j] + h2 * c[j + 1] + h3 * c[j + 2])
+            + v3 * (h0 * d[j - 1] + h1 * d[j] + h2 * d[j + 1] + h3 * d[j + 2])
+        )
+        if not np.isnan(value):
+            return value
+    upper = image[i, j] + h * (image[i, j + 1] - image[i, j])
+    lower = image[i + 1, j] + h * (image[i + 1, j + 1] - image[i + 1, j])
+    return upper + v * (lower - upper)
+
+
+@njit(cache=True, parallel=True, fastmath=FAST)
+def sample_cells(image, planes, step, u, reference, out):
+    """Bring an image onto the cells of a surface.
+
+    Parameters
+    ----------
+    image : float32 array (lines, samples)
+        NaN where missing.
+    planes : float32 array (6, node_rows, node_cols)
+        Array coordinates of the surface point: line and sample at u = 0, both per metre of u,
+        and both per metre that the point lies above the surface an orthoimage was made with.
+    step : int
+        Cells from node to node.
+    u : float32 array (rows, cols), m
+    reference : float32 array (rows, cols), m, or (1, 1)
+        That surface, on posts; of size 1 when the image is a raw one.
+    out : float32 array (rows - 1, cols - 1)
+    """
+    quarter = np.float32(0.25)
+    for i in prange(out.shape[0]):
+        r = np.int64(i)
+        cols = out.shape[1]
+        at = np.empty((6, cols), np.float32)
+        for k in range(6):
+            expand_row(planes[k], (r + 0.5) / step, step, at[k])
+        upper, lower = u[r], u[r + 1]
+        for c in range(cols):
+            h = quarter * (upper[c] + upper[c + 1] + lower[c] + lower[c + 1])
+            line, sample = at[0, c] + at[2, c] * h, at[1, c] + at[3, c] * h
+            if reference.size > 1:  # the view ray meets the orthoimage's own surface elsewhere
+                row, col = r + np.float32(0.5) + at[2, c] * h, c + np.float32(0.5) + at[3, c] * h
+                rise_row = rise_col = np.float32(0.0)
+                for _ in range(2):
+                    there = _sample(reference, row + rise_row, col + rise_col)
+                    rise = h - there if not np.isnan(there) else np.float32(0.0)
+                    rise_row, rise_col = at[4, c] * rise, at[5, c] * rise
+                line, sample = line + rise_row, sample + rise_col
+            out[r, c] = _sample(image, line, sample)
+
+
+@njit(cache=True, parallel=True, fastmath=FAST)
+def cast_shadow(u, planes, step, highest, out):
+    """True on cells from which the way to the Sun meets terrain.
+
+    Parameters
+    ----------
+    u : float32 array (rows, cols), m
+    planes : float32 array (2, node_rows, node_cols), posts per m
+        How far a ray to the Sun goes along rows and columns while it rises by 1 m.
+    step : int
+        Cells from node to node.
+    highest : float32, m
+        Of ``u``.
+    out : bool array (rows - 1, cols - 1)
+    """
+    rows, cols = u.shape
+    for i in prange(rows - 1):
+        r = np.int64(i)
+        at = np.empty((2, cols - 1), np.float32)
+        for k in range(2):
+            expand_row(planes[k], (r + 0.5) / step, step, at[k])
+        for c in range(cols - 1):
+            out[r, c] = _meets_terrain(u, r, c, at[0, c], at[1, c], highest)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _meets_terrain(u, r, c, per_metre_row, per_metre_col, highest):
+    """Follow the ray from a cell's centre, one post along the longer axis at a time."""
+    half, quarter = np.float32(0.5), np.float32(0.25)
+    length = max(abs(per_metre_row), abs(per_metre_col))
+    if length == 0:
+        return False
+    rise = np.float32(1.0) / length
+    d_row, d_col = per_metre_row * rise, per_metre_col * rise
+    height = quarter * (u[r, c] + u[r, c + 1] + u[r + 1, c] + u[r + 1, c + 1])
+    row, col = r + half, c + half
+    while True:
+        row, col, height = row + d_row, col + d_col, height + rise
+        inside = 0 <= row and 0 <= col and row <= u.shape[0] - 1 and col <= u.shape[1] - 1
+        if not inside or height > highest:
+            return False
+        i, j = min(np.int64(row), u.shape[0] - 2), min(np.int64(col), u.shape[1] - 2)
+        v, h = np.float32(row - i), np.float32(col - j)
+        upper = u[i, j] + h * (u[i, j + 1] - u[i, j])
+        lower = u[i + 1, j] + h * (u[i + 1, j + 1] - u[i + 1, j])
+        if upper + v * (lower - upper) > height:
+            return True
