@@ -13,6 +13,8 @@ from numba import njit, prange
 
 from lommel.core.multigrid import NormalEquations
 
+# direction and three tensors in; solution and residual in and out; diagonal in; new direction out
+SMOOTHING_BYTES = 40
 REPEATS = 7  # of which the fastest counts: other programs only ever take time away
 
 
@@ -70,19 +72,19 @@ def kernels(posts):
     """The `Speed` of one operator application and of one V-cycle.
 
     The operator reads the surface and three tensor planes and writes one plane: 20 bytes per post.
-    A V-cycle with a smoother of degree 3 applies it seven times on each level; the least that
-    each level must move is five planes for every application, as the smoother's updates can be
-    done while a row is at hand: the residual and the step are read and written besides.
+    A smoothing step also updates solution, residual and direction: 40 bytes (`SMOOTHING_BYTES`)
+    if all is done while a row is at hand. A V-cycle of degree d has 2 d + 1 such steps per level.
     """
     rng = np.random.default_rng(0)
     slopes = rng.standard_normal((2, posts - 1, posts - 1), np.float32)
     tensors = (slopes[0] ** 2, slopes[0] * slopes[1], slopes[1] ** 2)
     equations = NormalEquations(tensors, np.full(3, 0.1, np.float32), [0.0, 0.0, 1e-3])
+    steps = sum((2 * level.degree + 1) / 4**k for k, level in enumerate(equations.levels))
     u = rng.standard_normal((posts, posts), np.float32)
     out = np.empty_like(u)
     once = fastest(lambda: equations.levels[0].apply(u, out))
     cycle = fastest(lambda: equations.precondition(u))
     return [
         Speed("operator", once, posts**2, 20),
-        Speed("V-cycle", cycle, posts**2, 7 * 36 * 4 / 3),
+        Speed("V-cycle", cycle, posts**2, SMOOTHING_BYTES * steps),
     ]
