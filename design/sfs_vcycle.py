@@ -6,9 +6,9 @@ counts preconditioned iterations, and their work in applications of the finest o
 degree of the Chebyshev smoother and the share of tr(G) that resists a coarse cell's twist.
 
 Work to a reduction by 1e-3 at curvature weights of 1e-2, 3e-3, 3e-4 of the data's: degree 3
-everywhere with tr(G)/12 takes 114, 124, 134; degree 2 that doubles from level to level with tr(G)/64
-takes 90, 80, 70. On a measured system (one image, priors as estimated) it was 270 against 165. There
-a W-cycle and Galerkin coarse operators gained nothing, cubic transfer a further tenth.
+everywhere with tr(G)/12 takes 114, 124, 134; degree 2 that doubles from level to level with
+tr(G)/64 takes 90, 80, 70. On a measured system (one image, priors as estimated) it was 270 against
+165; a W-cycle and Galerkin coarse operators gained nothing there, cubic transfer a further tenth.
 
     python design/sfs_vcycle.py
 """
