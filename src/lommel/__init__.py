@@ -14,4 +14,13 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 __version__ = "0.1.0"
 
-__all__ = ["__version__"]
+__all__ = ["__version__", "albedo", "shape_from_shading"]
+
+
+def __getattr__(name):
+    """Load the Python interface when it is asked for, so that the commands start at once."""
+    if name in ("albedo", "shape_from_shading"):
+        from lommel import api
+
+        return getattr(api, name)
+    raise AttributeError(f"module 'lommel' has no attribute {name!r}")
