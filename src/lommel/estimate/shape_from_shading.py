@@ -28,9 +28,8 @@ from lommel.estimate.problem import best_photometry, fresh_problem
 from lommel.estimate.shading_kernels import SUM_COUNT, SUM_RR
 
 COARSEST = 24  # posts along the shorter side of the coarsest level that sees the images
-COARSE_STEPS = (
-    4  # Gauss-Newton steps per coarse level: all of them cost a third of one fine level's
-)
+COARSE_STEPS = 4  # Gauss-Newton steps per coarse level at most; 2 on the largest of them
+LARGE_IMAGE = 1_000_000  # cells, beyond which every fourth row and column tell a correlation
 SHORTEST_STEP = 0.1  # of a Gauss-Newton step: the cost that still rises has no way down
 ROUNDING = 1e-5  # relative, of a cost summed from float32 residuals
 POOR_FIT = 2.5  # noise standard errors, rms: more is not noise
@@ -84,8 +83,10 @@ class SurfaceSolution:
     exposures, hazes : array (images,)
     measured : list of float32 array (rows - 1, cols - 1), image units
         Images on the cells of the refined surface; NaN where not used.
-    modelled, started : list of float32 array (rows - 1, cols - 1), image units
-        What the refined and the initial surface predict there.
+    modelled : list of float32 array (rows - 1, cols - 1), image units
+        What the refined surface predicts there.
+    correlations : list of float
+        Of the images with what the initial surface predicts.
     misfits : array (images,), dimensionless
         Root mean square residual of each image, in noise standard errors.
     separation : float32 array (rows - 1, cols - 1), dimensionless
@@ -100,7 +101,7 @@ class SurfaceSolution:
     hazes: np.ndarray
     measured: list
     modelled: list
-    started: list
+    correlations: list
     misfits: np.ndarray
     separation: np.ndarray
     priors: Priors
@@ -138,7 +139,10 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
         spacing = (surface.grid.spacing[0] * surface.grid.spacing[1]) ** 0.5
         priors = (priors or PriorSettings()).applied_to(_estimate_priors(finest), spacing)
     finest.expect(priors)
-    started = [finest.predict(finest.initial, k) for k in range(len(views))]
+    correlations = [
+        correlation(cells, finest.predict(finest.initial, k))
+        for k, cells in enumerate(finest.cells)
+    ]
     history: list[dict] = []
     u, converged = _coarse_to_fine(finest, settings, history)
     if settings.estimate_albedo:
@@ -153,7 +157,7 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
         finest.hazes,
         finest.cells,
         modelled,
-        started,
+        correlations,
         misfits,
         separation(finest, u),
         priors,
@@ -178,11 +182,21 @@ def separation(level, u):
         0 with one image or images under one Sun: there albedo and slope cannot be told apart.
         Towards 1 with Suns from all around. NaN where no image counts.
     """
+    if len(level.views) == 1:
+        return np.where(np.isfinite(level.cells[0]), np.float32(0), np.float32(np.nan))
     bound = replace(level, albedo_error=0.0, slope=np.zeros(2, np.float32)).assemble(u)[0]
     free = replace(level, albedo_error=np.inf, slope=np.zeros(2, np.float32)).assemble(u)[0]
     signal = bound[0] + bound[2]
     share = (free[0] + free[2]) / np.where(signal > 0, signal, np.nan)
     return np.clip(share, 0, 1)
+
+
+def correlation(measured, modelled):
+    """Correlation of two images over the cells both have; of every fourth one in large images."""
+    stride = 1 if measured.size < LARGE_IMAGE else 4
+    pair = np.stack([image[::stride, ::stride].ravel() for image in (measured, modelled)])
+    pair = pair[:, np.isfinite(pair).all(axis=0)].astype(float)
+    return float(np.corrcoef(pair)[0, 1])
 
 
 def _coarse_to_fine(finest, settings, history):
@@ -202,7 +216,7 @@ def _coarse_to_fine(finest, settings, history):
             level.prepare_geometry(u)
             level.sample_images(u)
             level.find_shadows(u)
-        steps = settings.max_steps if level is finest else COARSE_STEPS
+        steps = settings.max_steps if level is finest else min(COARSE_STEPS, level.stride)
         u, converged = _descend(level, u, steps, settings, history)
     return u, converged
 

@@ -14,7 +14,7 @@ from lommel.errors import InputError
 from lommel.estimate.holes import fill_holes
 from lommel.estimate.priors import PriorSettings
 from lommel.estimate.problem import cos_incidence
-from lommel.estimate.shape_from_shading import SolverSettings, solve_surface
+from lommel.estimate.shape_from_shading import SolverSettings, correlation, solve_surface
 from lommel.estimate.surface import Surface
 from lommel.io.raster import write_raster
 from lommel.run.inputs import GridSettings, SceneFiles
@@ -195,12 +195,6 @@ def relative_residual(surface):
     return np.sqrt(total / np.where(count > 0, count, np.nan).astype(np.float32))
 
 
-def correlation(measured, modelled):
-    """Correlation of two images over the cells both have."""
-    both = np.isfinite(measured) & np.isfinite(modelled)
-    return float(np.corrcoef(measured[both], modelled[both])[0, 1])
-
-
 def _write_exposures(folder, views, skipped, surface):
     with open(folder / "exposures.csv", "w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -219,7 +213,7 @@ def _results(scene, refined, surface):
     brightness = [np.nanmedian(image) for image in surface.measured]
     return {
         "images": len(surface.measured),
-        "image_correlation_before": _mean_correlation(surface.measured, surface.started),
+        "image_correlation_before": float(np.mean(surface.correlations)),
         "image_correlation_after": _mean_correlation(surface.measured, surface.modelled),
         "image_correlation_without_albedo": _mean_correlation(surface.measured, shading),
         "image_residual_percent": float(np.sqrt(np.nanmean(relative_residual(surface) ** 2))),
