@@ -24,7 +24,7 @@ REDUCTIONS = (1e-1, 1e-2, 1e-3, 1e-4)
 MAX_CYCLES = 200
 # Far more than the default; tighter linear solves overshoot where the problem is not convex
 LONG = SolverSettings(
-    max_steps=25, step_tolerance=1e-5, gain_tolerance=1e-6, cycle_tolerance=0.05, max_cycles=80
+    max_steps=16, step_tolerance=1e-5, gain_tolerance=1e-5, cycle_tolerance=0.05, max_cycles=60
 )
 
 

@@ -210,7 +210,7 @@ def test_wildly_wrong_dem_is_reported_and_stays_finite(smooth, height):
     views = simulated_views(truth, grid, (40.0, 160.0, 280.0))
     wild = hills(truth.shape, seed=17, smooth=smooth, rms=height)
     solution = solve_surface(Surface(grid, 0.0), wild, views, reflectance_model())
-    assert solution.outcome in ("poor_start", "poor_fit", "contradiction")
+    assert solution.outcome != "converged"
     assert np.isfinite(solution.value.u).all()
 
 

@@ -41,18 +41,45 @@ def fit_albedo(shading, measured, noise, contrast, start):
     -------
     albedo : float32 array (rows, cols), mean 1
     """
-    weight = np.zeros(start.shape, np.float32)
-    pull = np.zeros(start.shape, np.float32)
-    for shade, image, sigma in zip(shading, measured, noise, strict=True):
-        used = np.where(np.isfinite(image), np.float32(sigma**-2.0), np.float32(0))
-        weight += used * shade * shade
-        pull += used * shade * np.where(used > 0, image, np.float32(0))
+    weight, pull = _information(shading, measured, noise)
     albedo = start
     stiffness = np.full((start.shape[0] - 1, start.shape[1] - 1), contrast**-2.0, np.float32)
     for _ in range(REWEIGHTINGS):
         albedo = albedo + _step(albedo, weight, pull, stiffness)
         stiffness = _reweighted(albedo, contrast)
     return albedo / np.float32(albedo.mean(dtype=float))
+
+
+def observed_contrast(shading, measured, noise):
+    """Standard deviation of the albedo's difference between neighbours, as the images show it.
+
+    Meant for images that tell each cell's albedo by themselves; their noise is taken off.
+
+    Parameters
+    ----------
+    shading, measured, noise
+        As in `fit_albedo`.
+
+    Returns
+    -------
+    contrast : float, dimensionless; 0 when noise explains all differences
+    """
+    weight, pull = _information(shading, measured, noise)
+    seen = np.where(weight > 0, weight, np.float32(np.nan))
+    albedo = pull / seen
+    differences = np.concatenate([np.diff(albedo, axis=axis).ravel() ** 2 for axis in (0, 1)])
+    return float(max(np.nanmean(differences) - 2 * np.nanmean(1 / seen), 0.0) ** 0.5)
+
+
+def _information(shading, measured, noise):
+    """Weight of each cell's albedo, and weight times albedo, summed over the images."""
+    weight = np.zeros(shading[0].shape, np.float32)
+    pull = np.zeros_like(weight)
+    for shade, image, sigma in zip(shading, measured, noise, strict=True):
+        used = np.where(np.isfinite(image), np.float32(sigma**-2.0), np.float32(0))
+        weight += used * shade * shade
+        pull += used * shade * np.where(used > 0, image, np.float32(0))
+    return weight, pull
 
 
 def _step(albedo, weight, pull, stiffness):

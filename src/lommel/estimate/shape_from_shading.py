@@ -22,7 +22,7 @@ import numpy as np
 from lommel.core.least_squares import Solution
 from lommel.core.multigrid import NormalEquations, conjugate_gradients, dot
 from lommel.core.normal_operator import prolong_add
-from lommel.estimate.albedo_field import fit_albedo
+from lommel.estimate.albedo_field import fit_albedo, observed_contrast
 from lommel.estimate.priors import Priors, PriorSettings, estimate_priors
 from lommel.estimate.problem import best_photometry, fresh_problem
 from lommel.estimate.shading_kernels import SUM_COUNT, SUM_RR
@@ -32,6 +32,7 @@ COARSE_STEPS = 4  # Gauss-Newton steps per coarse level at most; 2 on the larges
 LARGE_IMAGE = 1_000_000  # cells, beyond which every fourth row and column tell a correlation
 SHORTEST_STEP = 0.1  # of a Gauss-Newton step: the cost that still rises has no way down
 ROUNDING = 1e-5  # relative, of a cost summed from float32 residuals
+CELL_UNKNOWNS = 3  # two slopes and the albedo: what a cell's values determine
 POOR_FIT = 2.5  # noise standard errors, rms: more is not noise
 POOR_START = 0.25  # of the brightness taken for noise: the initial DEM explains nothing
 ODD_IMAGE = 1.5  # times the median of the others, which a false image spoils as well
@@ -145,11 +146,11 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
     ]
     history: list[dict] = []
     u, converged = _coarse_to_fine(finest, settings, history)
-    if settings.estimate_albedo:
-        _fit_albedo(finest, u, priors, settings)
-    modelled = [finest.predict(u, k) for k in range(len(views))]
     sums = finest.assemble(u)[2]
     misfits = np.sqrt(sums[:, SUM_RR] / np.maximum(sums[:, SUM_COUNT], 1))
+    if settings.estimate_albedo:
+        _fit_albedo(finest, u, priors, misfits, settings)
+    modelled = [finest.predict(u, k) for k in range(len(views))]
     value = SurfaceSolution(
         u,
         finest.albedo,
@@ -309,17 +310,18 @@ def _fit_photometry(level, u, settings):
     )
 
 
-def _fit_albedo(level, u, priors, settings):
+def _fit_albedo(level, u, priors, misfits, settings):
     """Albedo of the cells, given the surface; the exposures keep its mean at 1."""
     images = range(len(level.views))
     shading = [(level.predict(u, k) - level.hazes[k]) / level.albedo for k in images]
-    level.albedo = fit_albedo(
-        shading,
-        [c - haze for c, haze in zip(level.cells, level.hazes, strict=True)],
-        priors.noise,
-        priors.albedo_contrast,
-        level.albedo,
-    )
+    without_haze = [c - haze for c, haze in zip(level.cells, level.hazes, strict=True)]
+    noise, contrast = priors.noise, priors.albedo_contrast
+    if priors.albedo_error > 0:  # the images themselves show what noise and albedo are like
+        freedom = len(level.views) - CELL_UNKNOWNS
+        if freedom > 0:
+            noise = noise * np.minimum(misfits * (len(level.views) / freedom) ** 0.5, 1.0)
+        contrast = max(contrast, observed_contrast(shading, without_haze, noise))
+    level.albedo = fit_albedo(shading, without_haze, noise, contrast, level.albedo)
     _fit_photometry(level, u, settings)
 
 
