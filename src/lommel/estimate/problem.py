@@ -398,3 +398,20 @@ def best_photometry(sums, exposures, hazes, estimate_haze):
     haze = (ff * m - f * fm) / determinant
     exposure = (fm * (w + pull) - f * m) / determinant
     return np.where(has_data, exposure, exposures), np.where(has_data, haze, hazes)
+
+
+def exposure_gain(sums, exposures, hazes):
+    """By how much twice the cost falls when each exposure takes its best value.
+
+    Parameters
+    ----------
+    sums : float64 array (images, 8)
+    exposures, hazes : array (images,)
+
+    Returns
+    -------
+    gain : float
+    """
+    ff = sums[:, SUM_FF]
+    slope = sums[:, SUM_FM] - exposures * ff - hazes * sums[:, SUM_F]
+    return float((slope**2 / np.where(ff > 0, ff, np.inf)).sum())

@@ -24,7 +24,7 @@ from lommel.core.multigrid import NormalEquations, conjugate_gradients, dot
 from lommel.core.normal_operator import prolong_add
 from lommel.estimate.albedo_field import fit_albedo, observed_contrast
 from lommel.estimate.priors import Priors, PriorSettings, estimate_priors
-from lommel.estimate.problem import best_photometry, fresh_problem
+from lommel.estimate.problem import best_photometry, exposure_gain, fresh_problem
 from lommel.estimate.shading_kernels import SUM_COUNT, SUM_RR
 
 COARSEST = 24  # posts along the shorter side of the coarsest level that sees the images
@@ -135,7 +135,8 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
     finest.sample_images(finest.initial)
     finest.find_shadows(finest.initial)
     # a blurred DEM explains part of the contrast only: haze would seem to explain the rest
-    _fit_photometry(finest, finest.initial, replace(settings, estimate_haze=False))
+    first_sums = finest.assemble(finest.initial)[2]
+    _set_photometry(finest, first_sums, replace(settings, estimate_haze=False))
     if not isinstance(priors, Priors):
         spacing = (surface.grid.spacing[0] * surface.grid.spacing[1]) ** 0.5
         priors = (priors or PriorSettings()).applied_to(_estimate_priors(finest), spacing)
@@ -210,8 +211,11 @@ def _coarse_to_fine(finest, settings, history):
         level = levels[depth]
         if depth < len(levels) - 1:
             coarse = levels.pop()
-            correction, u = u - coarse.initial, level.initial.copy()
-            prolong_add(correction, u)
+            correction = np.zeros_like(level.initial)
+            prolong_add(u - coarse.initial, correction)
+            if settings.estimate_exposure:
+                correction = without_tilt(correction)
+            u = level.initial + correction
             level.exposures, level.hazes = coarse.exposures, coarse.hazes
         if level is finest:
             level.prepare_geometry(u)
@@ -230,22 +234,22 @@ def _descend(level, u, steps, settings, history):
         linear = conjugate_gradients(
             equations, -here.gradient, settings.cycle_tolerance, settings.max_cycles
         )
-        length, last = 1.0, here.cost
         gain = -dot(here.gradient, linear.x) / 2
-        u, start = u + linear.x, u
+        direction = without_tilt(linear.x) if settings.estimate_exposure else linear.x
+        length, last = 1.0, _best_cost(here, level, settings)
+        u, start = u + direction, u
         here = _look(level, u)
-        while not here.cost <= last and length > SHORTEST_STEP:
+        while not _best_cost(here, level, settings) <= last and length > SHORTEST_STEP:
             length /= 2
-            u = start + np.float32(length) * linear.x
+            u = start + np.float32(length) * direction
             here = _look(level, u)
-        if not here.cost <= last * (1 + ROUNDING):  # no way down: stay
+        cost = _best_cost(here, level, settings)
+        if not cost <= last * (1 + ROUNDING):  # no way down: stay
             _look(level, start)
-            return start, _is_small(np.float32(length) * linear.x, start, level, settings)
+            return start, _is_small(np.float32(length) * direction, start, level, settings)
         level.albedo = here.albedo
-        cost = here.cost
         if settings.estimate_exposure:
-            u = without_tilt(u, level.initial)
-            _fit_photometry(level, u, settings)
+            _set_photometry(level, here.sums, settings)
             here = level.expand(u)
         step = _rms(u - start)
         history.append(
@@ -274,26 +278,32 @@ def _rms(change):
     return float(np.sqrt(dot(change, change) / change.size))
 
 
-def without_tilt(u, initial):
-    """The surface with the mean height and tilt of the initial one.
+def without_tilt(change):
+    """A change of the surface without its mean and its mean tilt.
 
     An exposure and the tilt of the whole surface towards the Sun do the same to an image: what
     tells them apart is the initial DEM, whose mean plane is kept.
 
     Parameters
     ----------
-    u, initial : float32 array (rows, cols), m
+    change : float32 array (rows, cols), m
 
     Returns
     -------
-    u : float32 array (rows, cols), m
+    change : float32 array (rows, cols), m
     """
-    change = u - initial
     row, col = (np.linspace(-1.0, 1.0, size) for size in change.shape)
     by_row, by_col = change.mean(axis=1, dtype=float), change.mean(axis=0, dtype=float)
     along_rows = by_row.mean() + (row @ by_row) / (row @ row) * row
     along_cols = (col @ by_col) / (col @ col) * col
-    return u - along_rows.astype(np.float32)[:, None] - along_cols.astype(np.float32)[None, :]
+    return change - along_rows.astype(np.float32)[:, None] - along_cols.astype(np.float32)[None, :]
+
+
+def _best_cost(here, level, settings):
+    """The cost with the exposures that fit this surface best, which are closed-form."""
+    if not settings.estimate_exposure:
+        return here.cost
+    return here.cost - exposure_gain(here.sums, level.exposures, level.hazes) / 2
 
 
 def _look(level, u):
@@ -303,8 +313,7 @@ def _look(level, u):
     return level.expand(u)
 
 
-def _fit_photometry(level, u, settings):
-    sums = level.assemble(u)[2]
+def _set_photometry(level, sums, settings):
     level.exposures, level.hazes = best_photometry(
         sums, level.exposures, level.hazes, settings.estimate_haze
     )
@@ -322,7 +331,7 @@ def _fit_albedo(level, u, priors, misfits, settings):
             noise = noise * np.minimum(misfits * (len(level.views) / freedom) ** 0.5, 1.0)
         contrast = max(contrast, observed_contrast(shading, without_haze, noise))
     level.albedo = fit_albedo(shading, without_haze, noise, contrast, level.albedo)
-    _fit_photometry(level, u, settings)
+    _set_photometry(level, level.assemble(u)[2], settings)
 
 
 def _estimate_priors(level):
