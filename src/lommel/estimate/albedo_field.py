@@ -16,7 +16,7 @@ import numpy as np
 
 from lommel.core.multigrid import NormalEquations, conjugate_gradients
 
-REDUCTION = 1e-2  # of the linear residual per reweighting: leaves errors far below the noise
+REDUCTION = 0.1  # of the linear residual per reweighting: leaves errors below the noise
 MAX_CYCLES = 8
 REWEIGHTINGS = 3  # the first is least squares; two more settle the borders
 EDGE = 3.0  # times the expected difference: a border of units from there on
