@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from lommel.errors import InputError
-from lommel.estimate.albedo import AlbedoSettings
 from lommel.evaluate import relative_errors
 from lommel.run.albedo import run_albedo
 from lommel.run.evaluate import evaluate_product
@@ -26,8 +25,6 @@ TARGETS = {
     "albedo_rms_percent": "at most 3",
     "height_rmse_share_percent": "at most 33",
 }
-# the simulated ground scatters as its model says, and the simulated lens does not darken corners
-KNOWN_PHOTOMETRY = {"phase_factor": None, "fit_phase_factor": False, "fit_falloff": False}
 
 
 def _silent(iterable, description=""):
@@ -67,7 +64,6 @@ def run_demo(output, overwrite=False, progress=_silent, strip="apollo-orbit", cl
             run_albedo(
                 _files(ground),
                 folder / "albedo",
-                AlbedoSettings(**KNOWN_PHOTOMETRY),
                 progress=_named(progress, "albedo"),
             )
         with record.stage("sfs"):
