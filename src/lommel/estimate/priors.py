@@ -291,14 +291,17 @@ def _dem_errors(precision, first):
     """Errors of averages over 1, 2, 4, ... posts that hold each octave with the given precision.
 
     Averages over 2^l posts hold waves from twice to four times that length on, octave l and all
-    longer ones; so each level from the first known one adds what its octave still lacks.
+    longer ones; so each level from the first known one adds what its octave still lacks. Errors of
+    a DEM are correlated: averages over longer lengths are not believed to better than half the
+    error of the first.
     """
     errors = np.full(precision.size, np.inf)
     held = 0.0
     for level in range(first, precision.size):
         lacking = precision[level] - held
         if lacking > 0:
-            errors[level] = 1 / np.sqrt(lacking * 4.0**level)
+            least = errors[first] / 2 if np.isfinite(errors[first]) else 0.0
+            errors[level] = max(1 / np.sqrt(lacking * 4.0**level), least)
             held = precision[level]
     return errors
 

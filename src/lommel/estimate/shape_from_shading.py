@@ -264,7 +264,7 @@ def _descend(level, u, steps, settings, history):
         )
         # gains fall by a constant factor or faster, so the next one can be told
         next_gain, last_gain = gain * (min(gain / last_gain, 1.0) if last_gain else 1.0), gain
-        is_done = next_gain < settings.gain_tolerance * cost
+        is_done = next_gain < settings.gain_tolerance * abs(cost)
         if is_done or _is_small(u - start, u, level, settings):
             return u, True
     return u, False
