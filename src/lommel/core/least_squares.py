@@ -24,8 +24,3 @@ class Solution:
     outcome: str
     advice: str
     history: list[dict] = field(default_factory=list)
-
-    @property
-    def has_converged(self):
-        """True when the outcome is ``converged``."""
-        return self.outcome == "converged"

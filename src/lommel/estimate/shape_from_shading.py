@@ -4,15 +4,18 @@ Minimises, by Gauss-Newton from coarse to fine grids,
 
 .. math:: Q(u) = \frac12 \sum_k \sum_{cells}
           \rho\!\left(\frac{T^k A R^k(u) + b^k - I^k}{\sigma^k}\right)
-          + \frac12 \sum \left(\frac{\Delta^2 u}{s\,\sigma_c}\right)^2
-          + \frac12 \sum_{coarse} \left(\frac{S (u - u_0)}{\sigma_0}\right)^2
+          + \frac12 \sum \left(\frac{\Delta^2 v}{s\,\sigma_c}\right)^2
+          + \frac12 \sum \left(\frac{\Delta v}{s\,\sigma_s}\right)^2
+          + \frac12 \sum_l \sum_{coarse} \left(\frac{S_l v}{\sigma_l}\right)^2,
+          \quad v = u - \bar u
 
 The data term is that of the photoclinometry paper (its equation 1) over both of its
-parametrisations (`lommel.estimate.surface`). The second term expects terrain whose slope changes
-by :math:`\sigma_c` per post; the third holds the wavelengths that the initial DEM knows, with `S`
-the repeated restriction to posts as far apart as that DEM can be trusted. One pass over the images
-leaves one 2x2 tensor per cell (`lommel.estimate.shading_kernels`); the linear solve
-(`lommel.core.multigrid`) never sees an image. Most callers want `solve_surface`.
+parametrisations (`lommel.estimate.surface`). The others act on the difference to the expected
+surface :math:`\bar u`, the initial DEM smoothed over what it does not know: terrain changes its
+slope by :math:`\sigma_c` per post; slopes beyond :math:`\sigma_s` are rather albedo; and the
+averages :math:`S_l` of the initial DEM over :math:`2^l` posts err by :math:`\sigma_l`
+(`lommel.estimate.priors`). One pass over the images leaves one 2x2 tensor per cell
+(`lommel.estimate.shading_kernels`); the linear solve (`lommel.core.multigrid`) never sees an image. Most callers want `solve_surface`.
 """
 
 from dataclasses import dataclass, replace
