@@ -15,7 +15,8 @@ surface :math:`\bar u`, the initial DEM smoothed over what it does not know: ter
 slope by :math:`\sigma_c` per post; slopes beyond :math:`\sigma_s` are rather albedo; and the
 averages :math:`S_l` of the initial DEM over :math:`2^l` posts err by :math:`\sigma_l`
 (`lommel.estimate.priors`). One pass over the images leaves one 2x2 tensor per cell
-(`lommel.estimate.shading_kernels`); the linear solve (`lommel.core.multigrid`) never sees an image. Most callers want `solve_surface`.
+(`lommel.estimate.shading_kernels`); the linear solve (`lommel.core.multigrid`) never sees an image.
+Most callers want `solve_surface`.
 """
 
 from dataclasses import dataclass, replace
