@@ -37,6 +37,9 @@ DEGREE, LARGEST_DEGREE = 2, 16
 LEFT_SHARE = 0.75
 HOURGLASS = 1 / 64  # share of tr(G): enough against a checkerboard, soft to oblique stripes
 SMALLEST = 5  # posts along the shorter side below which the level is solved directly
+# Levels of the V-cycle that feel the terms of longer waves: those on which these terms weigh
+# against the slopes. Above, they would cost as much as they save.
+LONG_WAVES_FROM = 2
 SERIAL_POSTS = 64 * 1024  # below it a parallel loop costs more than it saves
 
 
@@ -50,6 +53,7 @@ class Level:
     mass: np.ndarray
     degree: int
     inverse_diagonal: np.ndarray
+    long_masses: np.ndarray
     x: np.ndarray
     residual: np.ndarray
     step: np.ndarray
@@ -61,8 +65,10 @@ class Level:
         return self.x.shape
 
     def apply(self, u, out):
-        """``out = A u`` without the long-wavelength term of finer levels."""
+        """``out = A u``, on the largest levels without the terms of long waves."""
         apply_operator(u, *self.tensors, self.curvature, self.hourglass, self.mass, out)
+        if self.long_masses.any():
+            add_long_waves(u, self.long_masses, out)
 
 
 class NormalEquations:
@@ -100,9 +106,11 @@ class NormalEquations:
                     restrict(finer_posts, posts)
             else:
                 posts = np.zeros((1, shape[1]), np.float32)
-            mass = posts + np.float32(coarse_masses(self.masses, len(self.levels))[0])
+            own, *longer = coarse_masses(self.masses, len(self.levels))
+            mass = posts + np.float32(own)
             degree = min(2 * finer.degree, LARGEST_DEGREE)
-            self.levels.append(_level(shape, coarse, weights, HOURGLASS, mass, degree))
+            felt = longer if len(self.levels) >= LONG_WAVES_FROM else ()
+            self.levels.append(_level(shape, coarse, weights, HOURGLASS, mass, degree, felt))
         self._inverse = _dense_inverse(self.levels[-1])
 
     @property
@@ -291,21 +299,17 @@ def _row_dot(a, b):
     return total
 
 
-def _level(shape, tensors, curvature, hourglass, mass, degree):
+def _level(shape, tensors, curvature, hourglass, mass, degree, longer=()):
     """Coefficients and work arrays of a grid."""
-    level = Level(
-        tensors,
-        curvature.astype(np.float32),
-        np.float32(hourglass),
-        mass,
-        degree,
-        *(np.zeros(shape, np.float32) for _ in range(5)),
-    )
+    long_masses = np.array([0.0, *longer])
+    inverse, *work = (np.zeros(shape, np.float32) for _ in range(5))
+    curvature, hourglass = curvature.astype(np.float32), np.float32(hourglass)
+    # each element m w w^T has weights w that sum to 1: a diagonal of m w keeps its eigenvalues
+    # below 1; a post far from the border holds the share 1 / 4^l of an average over 2^l x 2^l
+    lumped = np.float32((long_masses / 4.0 ** np.arange(long_masses.size)).sum())
     with threads_for(shape):
-        inverse_diagonal(
-            *tensors, level.curvature, level.hourglass, level.mass, level.inverse_diagonal
-        )
-    return level
+        inverse_diagonal(*tensors, curvature, hourglass, mass + lumped, inverse)
+    return Level(tensors, curvature, hourglass, mass, degree, inverse, long_masses, *work)
 
 
 def coarse_masses(masses, halvings):
