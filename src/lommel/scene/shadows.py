@@ -1,8 +1,8 @@
-"""Cast shadow: terrain that hides the Sun.
+"""Ways that terrain bars: to the Sun (cast shadow) and to a camera (hidden ground).
 
-From every post a ray marches towards the Sun, one post at a time, until terrain rises above it or
-it has cleared the highest terrain of the grid. The ray's height over the reference sphere grows as
-``d tan(e) + d^2 (1 + 2 tan(e)^2) / 2 R``: distance d, elevation e of the Sun, radius R.
+From every post a ray marches towards its target, one post at a time, until terrain rises above it
+or it has cleared the highest terrain of the grid. The ray's height over the reference sphere grows
+as ``d tan(e) + d^2 (1 + 2 tan(e)^2) / 2 R``: distance d, elevation e of the target, radius R.
 Most callers want `sunlit`.
 """
 
@@ -12,25 +12,33 @@ import numpy as np
 from lommel.scene.geometry import unit
 
 
-def sunlit(grid, heights, sun_position):
+def sunlit(grid, heights, sun_position, window=None):
     """True where no other terrain hides the Sun; facets turned from it are not looked at.
+
+    A camera's position in place of the Sun's tells which ground the camera sees.
 
     Parameters
     ----------
     grid : Grid
     heights : array (rows, cols), m
         NaN casts no shadow and is lit.
-    sun_position : array (3,), m, body-fixed
+    sun_position : array (3,) or (window.rows, window.cols, 3), m, body-fixed
+    window : Window, optional
+        The posts asked for; the terrain around them is only looked at. All by default.
 
     Returns
     -------
-    is_lit : bool array (rows, cols)
+    is_lit : bool array (window.rows, window.cols)
     """
-    heights = np.ascontiguousarray(heights, dtype=np.float64)
-    up = grid.xyz(0.0)
+    window = window or grid.window
+    heights = np.ascontiguousarray(heights)
+    if not np.isfinite(heights).any():
+        return np.ones(window.shape, bool)
+    ground = heights[window.slices]
+    up = grid.cut(window).xyz(0.0)
     to_south, to_east = np.gradient(up, axis=(0, 1))
-    to_sun = unit(np.asarray(sun_position, float) - up)
     up /= grid.body.radius
+    to_sun = unit(np.asarray(sun_position, float) - (grid.body.radius + ground)[..., None] * up)
     sine = np.einsum("...i,...i", to_sun, up)
     tangent = sine / np.sqrt(np.maximum(1.0 - sine**2, 1e-30))
     row_step, col_step = _steps(to_sun - sine[..., None] * up, to_south, to_east)
@@ -41,8 +49,15 @@ def sunlit(grid, heights, sun_position):
     distance = np.linalg.norm(
         row_step[..., None] * to_south + col_step[..., None] * to_east, axis=-1
     )
-    highest = np.nanmax(heights)
-    return _march(heights, row_step, col_step, distance, tangent, highest, grid.body.radius)
+    return _march(
+        heights,
+        (window.row, window.col),
+        (row_step, col_step),
+        distance,
+        tangent,
+        np.nanmax(heights),
+        grid.body.radius,
+    )
 
 
 def _steps(horizontal, to_south, to_east):
@@ -57,18 +72,18 @@ def _steps(horizontal, to_south, to_east):
 
 
 @numba.njit(cache=True, parallel=True)
-def _march(heights, row_step, col_step, distance, tangent, highest, radius):
-    rows, cols = heights.shape
+def _march(heights, first, steps, distance, tangent, highest, radius):
+    rows, cols = distance.shape
     is_lit = np.ones((rows, cols), np.bool_)
     for index in numba.prange(rows):
         row = np.int64(index)
         for col in range(cols):
             is_lit[row, col] = _sees_sun(
                 heights,
-                row,
-                col,
-                row_step[row, col],
-                col_step[row, col],
+                first[0] + row,
+                first[1] + col,
+                steps[0][row, col],
+                steps[1][row, col],
                 distance[row, col],
                 tangent[row, col],
                 highest,
@@ -81,6 +96,8 @@ def _march(heights, row_step, col_step, distance, tangent, highest, radius):
 def _sees_sun(heights, row, col, row_step, col_step, distance, tangent, highest, radius):
     rows, cols = heights.shape
     bend = (1.0 + 2.0 * tangent * tangent) / (2.0 * radius)
+    if not distance > 0.0:  # the target stands at the zenith
+        return True
     count = 1
     while True:
         there_row, there_col = row + count * row_step, col + count * col_step
