@@ -7,10 +7,13 @@ flight is an offset from the line that is exposed, so a ground point X lies on t
 .. math:: l_0 + A_0 \, D\!\left(f \frac{X_c}{Z_c}, f \frac{Y_c}{Z_c}\right) = 0, \quad
           (X_c, Y_c, Z_c) = M(t(L)) \, (X - C(t(L))),
 
-A0 the first row of A. Which sign A0 has is of no account. Most callers want `LineScanCamera`.
+A0 the first row of A. Which sign A0 has is of no account. Positions and rotations are those of the
+tables at the centre of every line and linear in between, which is off by an eighth of the square of
+a line's turn: 1e-13 rad for an orbiter that looks down. Most callers want `LineScanCamera`.
 """
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -27,18 +30,11 @@ MARGIN = 64.0  # lines before the first and behind the last that are still proje
 
 
 class Scan(NamedTuple):
-    """Times, positions and rotations of a line-scan image as the compiled kernels take them."""
+    """Positions and rotations of all lines as the compiled kernels take them."""
 
-    first: float  # line, the smallest that is projected
+    first: float  # line of the first entry
     last: float
-    first_lines: np.ndarray
-    first_times: np.ndarray
-    line_periods: np.ndarray
-    position_times: np.ndarray
-    positions: np.ndarray
-    velocities: np.ndarray
-    pointing_times: np.ndarray
-    quaternions: np.ndarray
+    poses: np.ndarray  # (n, 12): at the centre of every line, position and rotation, row by row
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +70,6 @@ class LineScanCamera(Camera):
     sun_trajectory: Trajectory | None = None
     to_pixels: np.ndarray | tuple = UPRIGHT
     plane: FocalPlane = field(init=False, repr=False)
-    scan: Scan = field(init=False, repr=False)
 
     def __post_init__(self):
         """Check the table of lines, and that the other tables cover them."""
@@ -89,24 +84,11 @@ class LineScanCamera(Camera):
                 "line_times must have ascending first lines and no line of zero seconds. Check "
                 "the camera file."
             )
-        scan = Scan(
-            -MARGIN,
-            self.shape[0] + MARGIN,
-            *np.ascontiguousarray(table.T),
-            self.trajectory.times,
-            self.trajectory.positions,
-            self.trajectory.velocities,
-            self.pointing.times,
-            self.pointing.quaternions,
-        )
         plane = focal_plane(self.focal_length, self.principal_point, self.to_pixels)
-        for name, value in {"line_times": table, "plane": plane, "scan": scan}.items():
-            object.__setattr__(self, name, value)
-        for name, times in {
-            "position": scan.position_times,
-            "pointing": scan.pointing_times,
-        }.items():
-            self._check_cover(name, times)
+        object.__setattr__(self, "line_times", table)
+        object.__setattr__(self, "plane", plane)
+        self._check_cover("position", self.trajectory.times)
+        self._check_cover("pointing", self.pointing.times)
 
     def _check_cover(self, name, times):
         ends = np.sort(self.time([0.0, self.shape[0]]))
@@ -117,6 +99,14 @@ class LineScanCamera(Camera):
                 f"image was taken from {ends[0]:.3f} to {ends[1]:.3f} s. Check that camera and "
                 "image belong together."
             )
+
+    @cached_property
+    def _scan(self):
+        lines = np.arange(-MARGIN, self.shape[0] + MARGIN + 1) + 0.5
+        times = self.time(lines)
+        rotations = self.pointing.at(times).reshape(-1, 9)
+        poses = np.concatenate([self.trajectory.at(times), rotations], axis=1)
+        return Scan(float(lines[0]), float(lines[-1]), poses)
 
     def time(self, line):
         """When lines were taken.
@@ -134,17 +124,17 @@ class LineScanCamera(Camera):
         row = np.maximum(np.searchsorted(firsts, line, side="right") - 1, 0)
         return times[row] + (line - firsts[row]) * periods[row]
 
-    @property
+    @cached_property
     def position(self):
         """Perspective centre at the middle line, body-fixed, m."""
         return self.trajectory.at(self._middle_time)
 
-    @property
+    @cached_property
     def rotation(self):
         """From body-fixed axes to the camera frame at the middle line."""
         return self.pointing.at(self._middle_time)
 
-    @property
+    @cached_property
     def sun_position(self):
         """Of the Sun at the middle line, body-fixed, m; None when nothing is known of it."""
         return None if self.sun_trajectory is None else self.sun_trajectory.at(self._middle_time)
@@ -166,7 +156,7 @@ class LineScanCamera(Camera):
         found = np.empty((2, *points.shape[:-1]))
         flat = found.reshape(2, -1)
         with threads_for(flat.shape):
-            project_line_scan(points.reshape(-1, 3), self.scan, self.plane, self._lens, *flat)
+            project_line_scan(points.reshape(-1, 3), self._scan, self.plane, self._lens, *flat)
         return found[0], found[1]
 
     def ray(self, line, sample):
@@ -175,7 +165,7 @@ class LineScanCamera(Camera):
         rays = np.empty((*line.shape, 3))
         flat = rays.reshape(-1, 3)
         with threads_for((line.size, 1)):
-            look_line_scan(line.ravel(), sample.ravel(), self.scan, self.plane, self._lens, flat)
+            look_line_scan(line.ravel(), sample.ravel(), self._scan, self.plane, self._lens, flat)
         return rays
 
     def origin(self, line, sample):

@@ -4,14 +4,14 @@ Positions are interpolated by cubic Hermite polynomials and rotations along the 
 is what ISIS does with the tables of a cube. Most callers want `Trajectory` and `Pointing`.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from lommel.errors import InputError
 from lommel.scene.camera import checked_rotation
-from lommel.scene.motion_kernels import positions_at, rotations_at
 
 NEIGHBOURS = 2  # on each side, from which a velocity is taken: a polynomial of degree 4
 
@@ -60,10 +60,9 @@ class Trajectory:
         xyz : array (..., 3), m
         """
         times = np.asarray(times, float)
-        out = np.empty((*times.shape, 3))
-        wanted = np.ascontiguousarray(times).reshape(-1)
-        positions_at(self.times, self.positions, self.velocities, wanted, out.reshape(-1, 3))
-        return out
+        if self.times.size == 1:
+            return self.positions[0] + (times - self.times[0])[..., None] * self.velocities[0]
+        return CubicHermiteSpline(self.times, self.positions, self.velocities)(times)
 
     def shifted(self, shift):
         """The same trajectory elsewhere; shift (3,) in m."""
@@ -80,13 +79,10 @@ class Pointing:
         Ascending.
     rotations : array (n, 3, 3)
         Rows are the camera's axes, body-fixed. Neighbours differ by less than half a turn.
-    quaternions : array (n, 4)
-        The same, scalar last, neighbours in the same half of the sphere.
     """
 
     times: np.ndarray
     rotations: np.ndarray
-    quaternions: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self):
         """Check the table."""
@@ -97,12 +93,8 @@ class Pointing:
                 f"rotations have shape {rotations.shape} at {times.size} times; give one 3 x 3 "
                 "matrix per time."
             )
-        quaternions = Rotation.from_matrix(rotations).as_quat()
-        turns_over = np.einsum("ij,ij->i", quaternions[1:], quaternions[:-1]) < 0
-        quaternions[1:][np.cumsum(turns_over) % 2 == 1] *= -1
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "rotations", rotations)
-        object.__setattr__(self, "quaternions", np.ascontiguousarray(quaternions))
 
     def at(self, times):
         """Rotations at other times.
@@ -117,10 +109,15 @@ class Pointing:
         rotations : array (..., 3, 3)
         """
         times = np.asarray(times, float)
-        out = np.empty((*times.shape, 3, 3))
-        wanted = np.ascontiguousarray(times).reshape(-1)
-        rotations_at(self.times, self.quaternions, wanted, out.reshape(-1, 3, 3))
-        return out
+        if self.times.size == 1:
+            return np.broadcast_to(self.rotations[0], (*times.shape, 3, 3))
+        wanted = times.ravel()
+        i = np.clip(np.searchsorted(self.times, wanted, side="right") - 1, 0, self.times.size - 2)
+        share = (wanted - self.times[i]) / (self.times[i + 1] - self.times[i])
+        nodes = Rotation.from_matrix(self.rotations)
+        turns = (nodes[1:] * nodes[:-1].inv()).as_rotvec()
+        turned = Rotation.from_rotvec(share[:, None] * turns[i]) * nodes[i]
+        return turned.as_matrix().reshape(*times.shape, 3, 3)
 
     def turned(self, rotation):
         """The same pointing after a constant rotation (3, 3) in the camera frame."""
