@@ -8,6 +8,8 @@ the way to the Sun from every cell. Slowly varying geometry comes as planes on a
 import numpy as np
 from numba import njit, prange
 
+from lommel.core.interpolation import sample_cubic
+
 FAST = {"contract", "nsz"}
 
 
@@ -36,48 +38,6 @@ def expand_row(plane, row, step, out):
         part = out[first : min(first + step, out.size)]
         for c in range(part.size):
             part[c] = start + slope * np.float32(c)
-
-
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _cubic_weights(t):
-    """Catmull-Rom weights of four neighbours, at a fraction t behind the second one."""
-    s = np.float32(1.0) - t
-    half = np.float32(0.5)
-    outer_left = -half * t * s * s
-    outer_right = -half * s * t * t
-    inner_right = t * (half + t * (np.float32(2.0) - np.float32(1.5) * t))
-    return (
-        outer_left,
-        np.float32(1.0) - outer_left - outer_right - inner_right,
-        inner_right,
-        outer_right,
-    )
-
-
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _sample(image, line, sample):
-    """Cubic interpolation; bilinear beside missing pixels and the border; NaN outside."""
-    lines, samples = image.shape
-    if not (line >= 0 and sample >= 0 and line <= lines - 1 and sample <= samples - 1):
-        return np.float32(np.nan)
-    i = min(np.int64(line), lines - 2)
-    j = min(np.int64(sample), samples - 2)
-    v, h = np.float32(line - i), np.float32(sample - j)
-    if 0 < i < lines - 2 and 0 < j < samples - 2:
-        h0, h1, h2, h3 = _cubic_weights(h)
-        v0, v1, v2, v3 = _cubic_weights(v)
-        a, b, c, d = image[i - 1], image[i], image[i + 1], image[i + 2]
-        value = (
-            v0 * (h0 * a[j - 1] + h1 * a[j] + h2 * a[j + 1] + h3 * a[j + 2])
-            + v1 * (h0 * b[j - 1] + h1 * b[j] + h2 * b[j + 1] + h3 * b[j + 2])
-            + v2 * (h0 * c[j - 1] + h1 * c[j] + h2 * c[j + 1] + h3 * c[j + 2])
-            + v3 * (h0 * d[j - 1] + h1 * d[j] + h2 * d[j + 1] + h3 * d[j + 2])
-        )
-        if not np.isnan(value):
-            return value
-    upper = image[i, j] + h * (image[i, j + 1] - image[i, j])
-    lower = image[i + 1, j] + h * (image[i + 1, j + 1] - image[i + 1, j])
-    return upper + v * (lower - upper)
 
 
 @njit(cache=True, parallel=True, fastmath=FAST)
@@ -113,11 +73,11 @@ def sample_cells(image, planes, step, u, reference, out):
                 row, col = r + np.float32(0.5) + at[2, c] * h, c + np.float32(0.5) + at[3, c] * h
                 rise_row = rise_col = np.float32(0.0)
                 for _ in range(2):
-                    there = _sample(reference, row + rise_row, col + rise_col)
+                    there = sample_cubic(reference, row + rise_row, col + rise_col)
                     rise = h - there if not np.isnan(there) else np.float32(0.0)
                     rise_row, rise_col = at[4, c] * rise, at[5, c] * rise
                 line, sample = line + rise_row, sample + rise_col
-            out[r, c] = _sample(image, line, sample)
+            out[r, c] = sample_cubic(image, line, sample)
 
 
 @njit(cache=True, parallel=True, fastmath=FAST)

@@ -9,7 +9,11 @@ Most callers want `sunlit`.
 import numba
 import numpy as np
 
+from lommel.scene.body import to_xyz
 from lommel.scene.geometry import unit
+from lommel.scene.grid import Window
+
+REACH_LIMIT = 3000  # posts; terrain farther away casts no shadow and hides nothing
 
 
 def sunlit(grid, heights, sun_position, window=None):
@@ -58,6 +62,53 @@ def sunlit(grid, heights, sun_position, window=None):
         np.nanmax(heights),
         grid.body.radius,
     )
+
+
+def reach(grid, window, relief, *positions):
+    r"""A window with the terrain that may stand between its posts and Sun or camera.
+
+    A ray that starts on the lowest ground clears the highest after the distance
+
+    .. math:: d = R \left( \sqrt{\tan^2 e + 2 h / R} - \tan e \right)
+
+    with the body's radius R, the relief h and the elevation e of its target.
+
+    Parameters
+    ----------
+    grid : Grid
+    window : Window
+    relief : float, m
+        Highest minus lowest terrain around.
+    positions : array (3,), m, body-fixed
+        Sun and camera.
+
+    Returns
+    -------
+    window : Window
+        Widened by 1 to `REACH_LIMIT` posts on each side, also beyond the grid.
+    """
+    radius = grid.body.radius
+    row = window.row + np.array([0.0, 0.5, 1.0])[:, None] * (window.rows - 1)
+    col = window.col + np.array([0.0, 0.5, 1.0]) * (window.cols - 1)
+    here = to_xyz(grid.body, *grid.lonlat_at(row, col), 0.0)
+    to_south = to_xyz(grid.body, *grid.lonlat_at(row + 1, col), 0.0) - here
+    to_east = to_xyz(grid.body, *grid.lonlat_at(row, col + 1), 0.0) - here
+    least, most = np.full(2, -1.0), np.full(2, 1.0)
+    for position in positions:
+        target, up = unit(np.asarray(position, float) - here), here / radius
+        sine = np.einsum("...i,...i", target, up)
+        cosine = np.sqrt(np.maximum(1.0 - sine**2, 1e-12))
+        tangent = np.maximum(sine / cosine, 0.0)
+        distance = radius * (np.sqrt(tangent**2 + 2.0 * relief / radius) - tangent)
+        way = (distance / cosine)[..., None] * (target - sine[..., None] * up)
+        steps = np.stack(_steps(way, to_south, to_east)).reshape(2, -1)
+        steps = steps[:, np.isfinite(steps).all(axis=0)]
+        least = np.minimum(least, steps.min(axis=1, initial=0.0) - 1.0)
+        most = np.maximum(most, steps.max(axis=1, initial=0.0) + 1.0)
+    least = np.clip(np.floor(least), -REACH_LIMIT, 0).astype(int)
+    most = np.clip(np.ceil(most), 0, REACH_LIMIT).astype(int)
+    first = np.array([window.row, window.col]) + least
+    return Window(*first.tolist(), *(np.array(window.shape) + most - least).tolist())
 
 
 def _steps(horizontal, to_south, to_east):
