@@ -6,9 +6,11 @@ Products are Cloud-Optimized GeoTIFFs, written beside their place and renamed wh
 rasterio lives in this module only. Most callers want `read_on_grid` and `write_raster`.
 """
 
+import json
 import os
+import shutil
 import warnings
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,6 +33,16 @@ DOWNSAMPLING = 1.5  # input pixels per post from which area means replace interp
 CLIPPED_8_BIT = (0.0, 255.0)  # image values that only say "at most" and "at least"
 GDAL_ERRORS = (RasterioError, CPLE_BaseError, OSError, ValueError)  # rasterio mixes them
 SPECIAL = 1e38  # ISIS marks missing pixels by values beyond it, double nodata is cut down to it
+BLOCK = 512  # pixels along each side of a GeoTIFF's tiles
+WRITING_SPACE = 2.4  # of a raster's plain size, while it is written: itself, overviews, the copy
+COG = {
+    "driver": "COG",
+    "compress": "deflate",
+    "predictor": "yes",
+    "level": 1,  # a third less time than the default for 2 % more bytes
+    "overview_resampling": "average",
+    "num_threads": 2,
+}
 MARGIN = 4  # pixels read around a window so that interpolation sees its neighbours
 
 
@@ -100,6 +112,28 @@ def raster_info(path, body=MOON):
             has_mask_band=_has_mask_band(file),
             grid=_grid_of(file, path, body),
         )
+
+
+def read_isis_label(path):
+    """Label of an ISIS cube, or of another raster that carries one, as nested dicts.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    label : dict or None
+        As in GDAL's metadata domain ``json:ISIS3``; None when the raster has no such label.
+    """
+    with _open(path) as file:
+        # rasterio takes the JSON for a line "key: value" and cuts it at its first colon
+        items = file.tags(ns="json:ISIS3").items()
+    try:
+        label = json.loads("".join(f"{start}:{rest}" for start, rest in items) or "null")
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: the ISIS label cannot be read: {error}") from error
+    return label if isinstance(label, dict) else None
 
 
 def read_grid(path, body=MOON):
@@ -315,18 +349,89 @@ def write_raster(path, values, grid, description, unit="", nodata=np.nan, valid=
             partial.unlink()
 
 
-def _write_cog(path, values, grid, texts, nodata, valid):
-    is_float = values.dtype.kind == "f"
-    profile = {
+@contextmanager
+def raster_writer(path, grid, description, unit="", dtype=np.float32, nodata=np.nan):
+    """One band written window by window; the Cloud-Optimized GeoTIFF appears whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+    grid : Grid
+    description, unit : str
+        Band description and unit, as GIS programs show them.
+    dtype : numpy type
+    nodata : float
+        Also the value of windows that are never written.
+
+    Yields
+    ------
+    write : function (values, window)
+        Windows whose edges are multiples of `BLOCK` are written fastest.
+    """
+    path = Path(path)
+    scratch, partial = (
+        path.with_name(f".{path.name}.{os.getpid()}.{x}") for x in ("scratch", "partial")
+    )
+    profile = _profile(grid, dtype, nodata) | {
+        "tiled": True,
+        "blockxsize": BLOCK,
+        "blockysize": BLOCK,
+        "sparse_ok": True,
+        "bigtiff": "if_safer",
+    }
+    _refuse_full_disk(path, grid, dtype)
+    try:
+        with rasterio.open(scratch, "w", **profile) as file:
+            file.set_band_description(1, description)
+            file.set_band_unit(1, unit)
+
+            def write(values, window):
+                part = FileWindow(window.col, window.row, window.cols, window.rows)
+                file.write(np.asarray(values, dtype), 1, window=part)
+
+            yield write
+        with rasterio.open(scratch) as file:
+            shrink = "average" if np.dtype(dtype).kind == "f" else "mode"
+            rasterio.shutil.copy(file, partial, **COG | {"overview_resampling": shrink})
+        os.replace(partial, path)
+    except GDAL_ERRORS as error:
+        raise InputError(f"{path} cannot be written: {error}") from error
+    finally:
+        for leftover in (scratch, partial):
+            with suppress(OSError):
+                leftover.unlink()
+
+
+def _refuse_full_disk(path, grid, dtype):
+    """GDAL says nothing when the disk is full: ask before."""
+    rows, cols = grid.shape
+    needed = int(WRITING_SPACE * rows * cols * np.dtype(dtype).itemsize)
+    free = shutil.disk_usage(path.parent).free
+    if needed > free:
+        raise InputError(
+            f"{path} needs up to {needed / 1e9:.1f} GB of disk, {free / 1e9:.1f} GB are free. "
+            "Free some, name another --output, or give a larger --spacing or narrower --bounds."
+        )
+
+
+def _profile(grid, dtype, nodata):
+    return {
         "driver": "GTiff",
         "height": grid.shape[0],
         "width": grid.shape[1],
-        "count": 1 if valid is None else 2,
-        "dtype": np.float32 if is_float else values.dtype,
+        "count": 1,
+        "dtype": dtype,
         "crs": grid.crs.to_wkt(),
         "transform": grid.affine,
-        "nodata": nodata if is_float else None,
+        "nodata": nodata,
     }
+
+
+def _write_cog(path, values, grid, texts, nodata, valid):
+    is_float = values.dtype.kind == "f"
+    dtype = np.float32 if is_float else values.dtype
+    profile = _profile(grid, dtype, nodata if is_float else None)
+    profile["count"] = 1 if valid is None else 2
     with rasterio.MemoryFile() as memory:
         with memory.open(**profile) as file:
             file.write(values.astype(profile["dtype"], copy=False), 1)
@@ -336,26 +441,26 @@ def _write_cog(path, values, grid, texts, nodata, valid):
                 file.write(np.where(valid, 255, 0).astype(profile["dtype"]), 2)
                 file.set_band_description(2, "mask")
         with memory.open() as file:
-            rasterio.shutil.copy(
-                file,
-                path,
-                driver="COG",
-                compress="deflate",
-                predictor="yes",
-                level=1,  # a third less time than the default for 2 % more bytes
-                overview_resampling="average",
-                num_threads=2,
-            )
+            rasterio.shutil.copy(file, path, **COG)
 
 
 def _open(path):
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            return rasterio.open(path)
+            return rasterio.open(_label(path))
     except GDAL_ERRORS as error:
         reason = "there is no such file" if not Path(path).exists() else str(error)
         raise InputError(f"{path} cannot be opened as a raster: {reason}") from error
+
+
+def _label(path):
+    """The file to open for a raster: of PDS images with a detached label, the label."""
+    path = Path(path)
+    if path.suffix.lower() == ".img":
+        labels = (path.with_suffix(suffix) for suffix in (".LBL", ".lbl"))
+        return next((label for label in labels if label.exists()), path)
+    return path
 
 
 def _has_mask_band(file):

@@ -18,6 +18,7 @@ from lommel.scene.geometry import Observation
 from lommel.scene.grid import Grid, Window, bounds_in, grid_from_bounds, read_crs
 
 POST_LIMIT = 2**30  # posts of the products: 4 GiB for every float32 array of them
+RADIUS_FROM = 0.5  # of the body's radius; no height comes near it
 DEM_IS_FINE_ENOUGH = 1.5  # image pixels per DEM post up to which the DEM's own grid is kept
 
 
@@ -191,6 +192,30 @@ def read_heights(paths, grid, body=MOON):
     -------
     heights : float32 array (rows, cols), m; NaN where no DEM knows
     """
+    heights = known_heights(paths, grid, body)
+    if not np.isfinite(heights).any():
+        raise InputError(
+            "The DEM has no height inside the output grid. Check --bounds, and that DEM and "
+            "images show the same region."
+        )
+    return heights
+
+
+def known_heights(paths, grid, body=MOON):
+    """The same as `read_heights`, also where no DEM knows anything.
+
+    A DEM that holds planetary radii, as those of the PDS do, is told by its size.
+
+    Parameters
+    ----------
+    paths : sequence of path
+    grid : Grid
+    body : Body
+
+    Returns
+    -------
+    heights : float32 array (rows, cols), m; NaN where no DEM knows
+    """
     total = np.zeros(grid.shape)
     count = np.zeros(grid.shape, np.int16)
     for path in paths:
@@ -199,13 +224,10 @@ def read_heights(paths, grid, body=MOON):
             continue
         part = read_on_grid(path, grid.cut(window), body)
         known = np.isfinite(part)
+        if known.any() and np.median(part[known]) > RADIUS_FROM * body.radius:
+            part = part.astype(float) - body.radius
         total[window.slices] += np.where(known, part, 0.0)
         count[window.slices] += known
-    if not count.any():
-        raise InputError(
-            "The DEM has no height inside the output grid. Check --bounds, and that DEM and "
-            "images show the same region."
-        )
     return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
 
 
