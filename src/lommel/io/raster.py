@@ -127,10 +127,12 @@ def read_isis_label(path):
         As in GDAL's metadata domain ``json:ISIS3``; None when the raster has no such label.
     """
     with _open(path) as file:
-        # rasterio takes the JSON for a line "key: value" and cuts it at its first colon
         items = file.tags(ns="json:ISIS3").items()
+    # rasterio takes a cube's JSON for a line "key: value" and cuts it at its first colon; a
+    # GeoTIFF's has a key of its own
+    texts = [text if not key.startswith("{") else f"{key}:{text}" for key, text in items]
     try:
-        label = json.loads("".join(f"{start}:{rest}" for start, rest in items) or "null")
+        label = json.loads(texts[0]) if texts else None
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: the ISIS label cannot be read: {error}") from error
     return label if isinstance(label, dict) else None
