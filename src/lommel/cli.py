@@ -218,6 +218,28 @@ def sfs(
 
 
 @app.command()
+def orthoproject(
+    images: Images,
+    dem: Dems,
+    output: Output,
+    cameras: Cameras = None,
+    sun_positions: SunTable = None,
+    positions_unit: Unit = "auto",
+    spacing: Spacing = None,
+    crs: Crs = None,
+    bounds: Bounds = None,
+    overwrite: Overwrite = False,
+):
+    """Bring raw images onto a DEM, with incidence, emission, phase and shadow at every post."""
+    from lommel.run.orthoproject import run_orthoproject
+
+    files = _files(images, dem, sun_positions, None, positions_unit, cameras)
+    with _progress("Projecting") as progress:
+        run_orthoproject(files, output, _grid(spacing, crs, bounds), overwrite, progress)
+    _finish(output, draws_report=None)
+
+
+@app.command()
 def simulate(
     scene: Annotated[str, typer.Argument(help="Preset (apollo-orbit, sfs-patch) or SCENE.toml.")],
     output: Output,
@@ -341,7 +363,10 @@ def _progress(title):
 
 
 def _finish(output, draws_report=True):
-    """Print outcome, results and skipped images, and the paths of the products."""
+    """Print outcome, results and skipped images, and the paths of the products.
+
+    ``draws_report`` is None for products that have no figures.
+    """
     record = json.loads((output / "run.json").read_text(encoding="utf-8"))
     for skip in record["skipped"]:
         log.print(f"[yellow]left out[/] {escape(skip['reason'])}", soft_wrap=True)
@@ -356,5 +381,5 @@ def _finish(output, draws_report=True):
         from lommel.report import write_report
 
         typer.echo(write_report(output))
-    else:
+    elif draws_report is False:
         log.print(f"lommel report {escape(str(output))} draws the figures.", soft_wrap=True)

@@ -101,12 +101,13 @@ def _sun(camera, sun_position, pixel):
     return camera.sun(*pixel) if camera.sun_position is not None else None
 
 
-def needed_pixels(tile, shape, margin=2):
-    """The part of an image that a tile's posts show.
+def needed_pixels(line, sample, shape, margin=2):
+    """The part of an image that posts show.
 
     Parameters
     ----------
-    tile : GroundTile
+    line, sample : array (rows, cols), px
+        NaN where the camera does not look.
     shape : tuple of int
         Lines and samples of the image.
     margin : int, px
@@ -115,15 +116,13 @@ def needed_pixels(tile, shape, margin=2):
     Returns
     -------
     window : Window
-        In pixels; empty when the tile shows none.
+        In pixels; empty when the posts show none.
     """
-    seen = tile.is_on_image
+    lines, samples = shape
+    seen = (line >= 0) & (line <= lines) & (sample >= 0) & (sample <= samples)
     if not seen.any():
         return Window(0, 0, 0, 0)
-    ends = [
-        (int(x[seen].min()) - margin, int(x[seen].max()) + margin + 1)
-        for x in (tile.line, tile.sample)
-    ]
+    ends = [(int(x[seen].min()) - margin, int(x[seen].max()) + margin + 1) for x in (line, sample)]
     (line, last_line), (sample, last_sample) = ends
     window = Window(line, sample, last_line - line, last_sample - sample)
     return window.intersection(Window(0, 0, *shape))
