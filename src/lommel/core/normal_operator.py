@@ -84,8 +84,8 @@ def apply_operator(u, gpp, gpq, gqq, curvature, hourglass, mass, out):
     Parameters
     ----------
     u, out : float32 array (rows, cols)
-    gpp, gpq, gqq : float32 array (rows - 1, cols - 1)
-        The tensor of each cell, per squared difference.
+    gpp, gpq, gqq : float32 array (rows - 1, cols - 1) or (1, cols - 1)
+        The tensor of each cell, per squared difference; one row serves all when they are the same.
     curvature : float32 array (3,)
         Weights of u_xx (along a row), u_xy and u_yy, per squared second difference.
     hourglass : float
@@ -107,9 +107,9 @@ def apply_operator(u, gpp, gpq, gqq, curvature, hourglass, mass, out):
             _cell_fluxes(
                 u[r],
                 u[r + 1],
-                gpp[r],
-                gpq[r],
-                gqq[r],
+                gpp[min(r, gpp.shape[0] - 1)],
+                gpq[min(r, gpp.shape[0] - 1)],
+                gqq[min(r, gpp.shape[0] - 1)],
                 curvature[1],
                 np.float32(hourglass),
                 flux[0],
@@ -122,9 +122,9 @@ def apply_operator(u, gpp, gpq, gqq, curvature, hourglass, mass, out):
                 _cell_fluxes(
                     u[r],
                     u[r + 1],
-                    gpp[r],
-                    gpq[r],
-                    gqq[r],
+                    gpp[min(r, gpp.shape[0] - 1)],
+                    gpq[min(r, gpp.shape[0] - 1)],
+                    gqq[min(r, gpp.shape[0] - 1)],
                     curvature[1],
                     np.float32(hourglass),
                     flux[0],

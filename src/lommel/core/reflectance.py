@@ -114,7 +114,7 @@ class ReflectanceModel:
 
     @property
     def kind(self) -> int:
-        """Branch of :func:`lommel.core.reflectance_kernels.reflectance_row`; -1 for user models."""
+        """Number of the twin in :mod:`lommel.core.reflectance_kernels`; -1 for user models."""
         return self.law.kind
 
     def parameter_array(self) -> np.ndarray:

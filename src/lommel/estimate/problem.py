@@ -23,7 +23,6 @@ from lommel.estimate.shading_kernels import (
     SUM_W,
     assemble,
     cosines,
-    eliminate_albedo,
     predict,
 )
 from lommel.scene.geometry import unit
@@ -70,7 +69,7 @@ class Problem:
     weights: np.ndarray
     stride: int
     initial: np.ndarray
-    cells: list
+    cells: np.ndarray
     albedo: np.ndarray
     curvature: np.ndarray
     masses: np.ndarray
@@ -89,7 +88,7 @@ class Problem:
         at_nodes = lattice_heights(u, lattice)
         frame = self.surface.frame(lattice, at_nodes)
         gram = frame.gram.astype(np.float32)
-        lights = [light_planes(frame, view, self.model) for view in self.views]
+        lights = np.stack([light_planes(frame, view, self.model) for view in self.views])
         self.geometry = [lattice, at_nodes, frame, gram, lights]
 
     def expand(self, u):
@@ -105,62 +104,49 @@ class Problem:
     def assemble(self, u):
         """Tensors, slope gradient, sums, best albedo and its cost at ``u``; data only."""
         lattice, _, _, gram, lights = self.geometry
-        cells = (u.shape[0] - 1, u.shape[1] - 1)
-        tensors = np.zeros((3, *cells), np.float32)
-        gradient = np.zeros((2, *cells), np.float32)
-        shared = np.zeros((4, *cells), np.float32)
-        spacing = np.array(self.surface.grid.spacing, np.float32) * self.stride
-        parameters = self.model.parameter_array()
-        sums = np.zeros((len(self.views), 8))
+        shape = self.albedo.shape
+        tensors, gradient = np.empty((3, *shape), np.float32), np.empty((2, *shape), np.float32)
+        is_free = self.albedo_error > 0
+        best = np.empty_like(self.albedo) if is_free else self.albedo
+        weights = self.weights * self.stride**2  # a coarse cell averages stride^2 fine ones
+        images = [self.exposures, self.hazes, weights, self.weights / HUBER_SCALE**2]
         with threads_for(u.shape):
-            for k, light in enumerate(lights):
-                weight = (
-                    self.weights[k] * self.stride**2
-                )  # a coarse cell averages stride^2 fine ones
-                softness = self.weights[k] / HUBER_SCALE**2
-                image = np.array([self.exposures[k], self.hazes[k], weight, softness], np.float32)
-                sums[k] = assemble(
-                    u,
-                    gram,
-                    light,
-                    lattice.step,
-                    spacing,
-                    self.model.kind,
-                    parameters,
-                    self._law(u, k),
-                    self.albedo,
-                    self.cells[k],
-                    image,
-                    tensors,
-                    gradient,
-                    shared,
-                )
-            best, albedo_cost = self.albedo, 0.0
-            if self.albedo_error > 0:
-                best = np.empty_like(self.albedo)
-                precision = np.float32(self.stride**2 / self.albedo_error**2)
-                albedo_cost = eliminate_albedo(
-                    self.albedo, tensors, gradient, shared, precision, best
-                )
-        tensors[0] += self.slope[0]
-        tensors[2] += self.slope[1]
+            sums, albedo_cost = assemble(
+                u,
+                gram,
+                lights,
+                lattice.step,
+                self._spacing(),
+                self.model.kind,
+                self.model.parameter_array(),
+                np.stack([self._law(u, k) for k in range(len(self.views))]),
+                self.albedo,
+                self.cells,
+                np.stack(images, axis=1).astype(np.float32),
+                np.float32(self.stride**2 / self.albedo_error**2 if is_free else -1.0),
+                self.slope,
+                tensors,
+                gradient,
+                best,
+            )
         return tensors, gradient, sums, best, albedo_cost
+
+    def _spacing(self):
+        return np.array(self.surface.grid.spacing, np.float32) * np.float32(self.stride)
 
     def _law(self, u, k):
         """Reflectance and derivatives of a model without compiled twin; else a placeholder."""
         if self.model.kind >= 0:
             return np.zeros((3, 1, 1), np.float32)
         lattice, _, _, gram, lights = self.geometry
-        planes = np.empty((4, u.shape[0] - 1, u.shape[1] - 1), np.float32)
-        spacing = np.array(self.surface.grid.spacing, np.float32) * self.stride
-        cosines(u, gram, lights[k], lattice.step, spacing, planes)
+        planes = np.empty((4, *self.albedo.shape), np.float32)
+        cosines(u, gram, lights[k], lattice.step, self._spacing(), planes)
         return np.stack(self.model.with_derivatives(*planes[:3])).astype(np.float32)
 
     def predict(self, u, k):
         """Modelled image ``k`` on the cells."""
         lattice, _, _, gram, lights = self.geometry
-        out = np.empty((u.shape[0] - 1, u.shape[1] - 1), np.float32)
-        spacing = np.array(self.surface.grid.spacing, np.float32) * self.stride
+        out = np.empty_like(self.albedo)
         image = np.array([self.exposures[k], self.hazes[k]], np.float32)
         with threads_for(u.shape):
             predict(
@@ -168,7 +154,7 @@ class Problem:
                 gram,
                 lights[k],
                 lattice.step,
-                spacing,
+                self._spacing(),
                 self.model.kind,
                 self.model.parameter_array(),
                 self._law(u, k),
@@ -208,9 +194,9 @@ class Problem:
 
     def prior_gradient(self, u):
         """Gradient of the prior terms at ``u``, and their cost."""
-        rows, cols = u.shape
+        cols = u.shape[1]
         change = u - self.expected
-        along, across = (np.full((rows - 1, cols - 1), weight) for weight in self.slope)
+        along, across = (np.full((1, cols - 1), weight) for weight in self.slope)
         none = np.zeros_like(along)
         massless = np.zeros((1, cols), np.float32)
         out = np.empty_like(u)
@@ -258,7 +244,7 @@ class Problem:
             shadows=[],
             initial=coarse_posts(self.initial),
             expected=coarse_posts(self.expected),
-            cells=[coarse_cells(cells) for cells in self.cells],
+            cells=np.stack([coarse_cells(cells) for cells in self.cells]),
             albedo=np.nan_to_num(coarse_cells(self.albedo), nan=1.0),
             curvature=self.curvature / 4,
             masses=coarse_masses(self.masses, 1),
@@ -282,7 +268,7 @@ def fresh_problem(surface, initial, views, model, albedo):
         np.ones(count),
         1,
         np.ascontiguousarray(initial, np.float32),
-        [np.empty((rows - 1, cols - 1), np.float32) for _ in views],
+        np.empty((count, rows - 1, cols - 1), np.float32),
         albedo,
         curvature=np.zeros(3, np.float32),
         masses=np.zeros(1),
