@@ -2,9 +2,10 @@
 
 Rays come from a camera, ``camera.origin(line, sample)`` and ``camera.ray(line, sample)``. A sphere
 and an ellipsoid are met in closed form. On a terrain a ray is followed from the height of its
-highest post to that of its lowest, half a post at a time, and where it dips into the bilinear
-surface between posts the step is halved down to a tenth of a millimetre; so a ray that grazes a
-ridge meets it, and not the plain behind it. Most callers want `meet_sphere` and `meet_terrain`.
+highest post to that of its lowest, cell by cell. Between four posts the terrain is bilinear, hence
+a parabola under a straight line, so a ray that only grazes a ridge meets it, and not the plain
+behind it; the place is found by bisection to a tenth of a millimetre. Most callers want
+`meet_sphere` and `meet_terrain`.
 """
 
 import numpy as np

@@ -3,13 +3,27 @@
 Most callers want `lommel.scene.intersection`.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit, prange
 
 FAST = {"contract", "nsz"}
 BLOCK = 1024  # rays per parallel work item
-STRIDE = 0.5  # posts walked at a time; a ridge narrower than this along the ray may be missed
+INSIDE = 1e-6  # posts; clearances of a cell are taken this far from its border
+LEAST_STEP = 1e-6  # knots, for rays that come down almost upright
 CLOSE = 1e-4  # m along the ray, where bisection ends
+UNKNOWN, ABOVE, UNDERGROUND, MET = range(4)
+
+
+class Ray(NamedTuple):
+    """A ray over a terrain; knots are counted from `start` and lie `pace` apart."""
+
+    origin: np.ndarray  # m
+    direction: np.ndarray
+    start: float  # m
+    pace: float  # m
+    radius: float  # m, from which heights count
 
 
 @njit(cache=True, parallel=True)
@@ -68,45 +82,84 @@ def _bilinear(heights, row, col):
 
 
 @njit(cache=True, nogil=True)
-def _clearance(o, d, distance, start, pace, knots, heights, radius):
-    """Height of a ray above the terrain; NaN where the terrain is unknown."""
-    row, col = _cubic(knots, (distance - start) / pace)
-    x, y, z = o[0] + distance * d[0], o[1] + distance * d[1], o[2] + distance * d[2]
-    return np.sqrt(x * x + y * y + z * z) - radius - _bilinear(heights, row, col)
+def _clearance(ray, at, knots, heights):
+    """Height of a ray above the terrain, at a knot or between; NaN where terrain is unknown."""
+    row, col = _cubic(knots, at)
+    distance = ray.start + at * ray.pace
+    x = ray.origin[0] + distance * ray.direction[0]
+    y = ray.origin[1] + distance * ray.direction[1]
+    z = ray.origin[2] + distance * ray.direction[2]
+    return np.sqrt(x * x + y * y + z * z) - ray.radius - _bilinear(heights, row, col)
 
 
 @njit(cache=True, nogil=True)
-def _meet(o, d, start, end, knots, heights, radius):
-    """Walk along a ray until it dips into the terrain, then halve the last step."""
+def _to_border(index, rate):
+    """How far to the next whole row or column, in knots, at a rate of rows or columns per knot."""
+    if rate > 0.0:
+        return (np.floor(index) + 1.0 - index) / rate
+    if rate < 0.0:
+        return (np.ceil(index) - 1.0 - index) / rate
+    return np.inf
+
+
+@njit(cache=True, nogil=True)
+def _dip(above, below, ray, knots, heights):
+    """Place between one above the terrain and one below it where the ray goes under."""
+    while (below - above) * ray.pace > CLOSE:
+        middle = 0.5 * (above + below)
+        if middle in (above, below):
+            break
+        if _clearance(ray, middle, knots, heights) > 0.0:
+            above = middle
+        else:
+            below = middle
+    return 0.5 * (above + below)
+
+
+@njit(cache=True, nogil=True)
+def _meet_in_cell(first, last, was_above, ray, knots, heights):
+    """Place in a cell where a ray meets the terrain, and how it fares behind the cell.
+
+    A bilinear surface under a straight line is a parabola, so three clearances tell all.
+    """
+    near = _clearance(ray, first, knots, heights)
+    middle = _clearance(ray, 0.5 * (first + last), knots, heights)
+    far = _clearance(ray, last, knots, heights)
+    if np.isnan(near + middle + far):
+        return np.nan, UNKNOWN
+    if near <= 0.0:
+        return (first, MET) if was_above else (np.nan, UNDERGROUND)
+    if far <= 0.0:
+        return _dip(first, last, ray, knots, heights), MET
+    bend, slope = 2.0 * (near - 2.0 * middle + far), 4.0 * middle - 3.0 * near - far
+    if bend > 0.0 and 0.0 < -slope < 2.0 * bend:
+        lowest = first - 0.5 * slope / bend * (last - first)
+        if _clearance(ray, lowest, knots, heights) <= 0.0:
+            return _dip(first, lowest, ray, knots, heights), MET
+    return np.nan, ABOVE
+
+
+@njit(cache=True, nogil=True)
+def _meet(ray, knots, heights):
+    """Place on a ray, in knots, where it first dips into the terrain, cell by cell."""
     spans = knots.shape[0] - 1
-    pace = (end - start) / spans
-    above, was_known, was_above = start, False, False
+    state = UNKNOWN
     for span in range(spans):
-        run = np.hypot(knots[span + 1, 0] - knots[span, 0], knots[span + 1, 1] - knots[span, 1])
-        if np.isnan(run):
-            was_known = was_above = False
+        row_rate = knots[span + 1, 0] - knots[span, 0]
+        col_rate = knots[span + 1, 1] - knots[span, 1]
+        if np.isnan(row_rate + col_rate):
+            state = UNKNOWN
             continue
-        steps = np.int64(min(run / STRIDE, 1e7)) + 1
-        for step in range(1 if span > 0 else 0, steps + 1):
-            distance = start + (span + step / steps) * pace
-            clearance = _clearance(o, d, distance, start, pace, knots, heights, radius)
-            is_known = not np.isnan(clearance)
-            if clearance > 0.0:
-                above = distance
-            elif is_known and was_above:
-                below = distance
-                while below - above > CLOSE:
-                    middle = 0.5 * (above + below)
-                    if middle in (above, below):
-                        break
-                    if _clearance(o, d, middle, start, pace, knots, heights, radius) > 0.0:
-                        above = middle
-                    else:
-                        below = middle
-                return 0.5 * (above + below)
-            elif is_known and not was_known:
-                return np.nan  # it came through unknown ground
-            was_known, was_above = is_known, clearance > 0.0
+        nudge = min(INSIDE / max(abs(row_rate), abs(col_rate), INSIDE), LEAST_STEP)
+        at, end = np.float64(span), span + 1.0
+        while at < end:
+            row, col = _cubic(knots, at)
+            step = min(_to_border(row, row_rate), _to_border(col, col_rate), end - at)
+            last = max(at + step - nudge, at)
+            place, state = _meet_in_cell(at, last, state == ABOVE, ray, knots, heights)
+            if state == MET or state == UNDERGROUND:
+                return place
+            at += max(step + nudge, LEAST_STEP)
     return np.nan
 
 
@@ -135,7 +188,9 @@ def meet_heights(origin, direction, start, end, knots, heights, radius, out, pla
         for i in range(first, min(first + BLOCK, out.size)):
             out[i] = np.nan
             if start[i] < end[i]:
-                out[i] = _meet(origin[i], direction[i], start[i], end[i], knots[i], heights, radius)
-            pace = (end[i] - start[i]) / (knots.shape[1] - 1)
-            if not np.isnan(out[i]):
-                place[i] = _cubic(knots[i], (out[i] - start[i]) / pace)
+                pace = (end[i] - start[i]) / (knots.shape[1] - 1)
+                ray = Ray(origin[i], direction[i], start[i], pace, radius)
+                at = _meet(ray, knots[i], heights)
+                out[i] = start[i] + at * pace
+                if not np.isnan(at):
+                    place[i] = _cubic(knots[i], at)

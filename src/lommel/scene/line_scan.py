@@ -8,8 +8,8 @@ flight is an offset from the line that is exposed, so a ground point X lies on t
           (X_c, Y_c, Z_c) = M(t(L)) \, (X - C(t(L))),
 
 A0 the first row of A. Which sign A0 has is of no account. Positions and rotations are those of the
-tables at the centre of every line and linear in between, which is off by an eighth of the square of
-a line's turn: 1e-13 rad for an orbiter that looks down. Most callers want `LineScanCamera`.
+tables at the edge of every line and linear within it, which is off by an eighth of the square of a
+line's turn: 1e-13 rad for an orbiter that looks down. Most callers want `LineScanCamera`.
 """
 
 from dataclasses import dataclass, field, replace
@@ -34,7 +34,7 @@ class Scan(NamedTuple):
 
     first: float  # line of the first entry
     last: float
-    poses: np.ndarray  # (n, 12): at the centre of every line, position and rotation, row by row
+    poses: np.ndarray  # (n, 12): at the upper edge of every line, position and rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ class LineScanCamera(Camera):
 
     @cached_property
     def _scan(self):
-        lines = np.arange(-MARGIN, self.shape[0] + MARGIN + 1) + 0.5
+        lines = np.arange(-MARGIN, self.shape[0] + MARGIN + 1)
         times = self.time(lines)
         rotations = self.pointing.at(times).reshape(-1, 9)
         poses = np.concatenate([self.trajectory.at(times), rotations], axis=1)

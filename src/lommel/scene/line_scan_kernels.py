@@ -20,7 +20,7 @@ STEPS = 40  # 3 to 8 are needed; more only where no line sees the point
 
 @njit(cache=True, nogil=True, fastmath=FAST)
 def _pose(scan, line, centre, axes):
-    """Position and rotation of a line, linear between the centres of lines."""
+    """Position and rotation of a line, linear between the edges of lines."""
     at = line - scan.first
     i = min(max(np.int64(at), 0), scan.poses.shape[0] - 2)
     t = at - i
