@@ -8,7 +8,7 @@ difference to the expected surface. Most callers want `lommel.estimate.shape_fro
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.ndimage import binary_dilation, gaussian_filter
+from scipy.ndimage import gaussian_filter
 
 from lommel.core.multigrid import add_long_waves, coarse_masses, dot, threads_for
 from lommel.core.normal_operator import apply_operator, coarse_shape, restrict, slope_adjoint
@@ -26,6 +26,7 @@ from lommel.estimate.shading_kernels import (
     predict,
 )
 from lommel.scene.geometry import unit
+from lommel.scene.masks import widened
 
 SLOPE_STEP = 0.01  # for the change of brightness with slope: R bends little over half a degree
 HAZE_ERROR = 0.1  # of the mean brightness: scattered light and film base are not more
@@ -229,10 +230,10 @@ class Problem:
             lateral = to_sun / np.maximum(sine, LOWEST_SUN)[..., None] - frame.up
             rays = self.surface.posts_crossed(lattice, at_nodes, lateral).astype(np.float32)
             shadow = np.empty(cells.shape, np.bool_)
+            darkest = np.float32(DARK * np.nanmedian(cells[::4, ::4]))
             with threads_for(u.shape):
-                cast_shadow(u, rays, lattice.step, np.float32(u.max()), shadow)
-            is_dark = ~(cells > DARK * np.nanmedian(cells[::4, ::4]))
-            self.shadows.append(binary_dilation(shadow & is_dark))
+                cast_shadow(u, rays, lattice.step, u.max(), cells, darkest, shadow)
+            self.shadows.append(widened(shadow))
             cells[self.shadows[-1]] = np.nan
 
     def coarser(self):

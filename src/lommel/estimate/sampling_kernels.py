@@ -81,28 +81,32 @@ def sample_cells(image, planes, step, u, reference, out):
 
 
 @njit(cache=True, parallel=True, fastmath=FAST)
-def cast_shadow(u, planes, step, highest, out):
-    """True on cells from which the way to the Sun meets terrain.
+def cast_shadow(u, planes, step, highest, cells, darkest, out):
+    """True on dark cells from which the way to the Sun meets terrain.
 
     Parameters
     ----------
     u : float32 array (rows, cols), m
     planes : float32 array (2, node_rows, node_cols), posts per m
-        How far a ray to the Sun goes along rows and columns while it rises by 1 m.
+        Rows and columns that the way to the Sun crosses per metre of rise.
     step : int
         Cells from node to node.
-    highest : float32, m
-        Of ``u``.
+    highest : float, m
+        Of the whole surface: above it nothing casts shadow.
+    cells : float32 array (rows - 1, cols - 1), image units
+    darkest : float, image units
+        Cells that are brighter are not in shadow, whatever the terrain says.
     out : bool array (rows - 1, cols - 1)
     """
-    rows, cols = u.shape
-    for i in prange(rows - 1):
+    for i in prange(out.shape[0]):
         r = np.int64(i)
-        at = np.empty((2, cols - 1), np.float32)
-        for k in range(2):
-            expand_row(planes[k], (r + 0.5) / step, step, at[k])
-        for c in range(cols - 1):
-            out[r, c] = _meets_terrain(u, r, c, at[0, c], at[1, c], highest)
+        at = np.empty((2, out.shape[1]), np.float32)
+        expand_row(planes[0], (r + 0.5) / step, step, at[0])
+        expand_row(planes[1], (r + 0.5) / step, step, at[1])
+        for c in range(out.shape[1]):
+            out[r, c] = cells[r, c] <= darkest and _meets_terrain(
+                u, r, c, at[0, c], at[1, c], highest
+            )
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)

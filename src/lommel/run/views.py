@@ -7,7 +7,6 @@ orthoimage. Most callers want `read_views`.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import binary_erosion
 
 from lommel.errors import GeometryError, InputError, LommelError
 from lommel.io.cameras import find_camera, read_camera
@@ -26,7 +25,7 @@ from lommel.run.inputs import (
 from lommel.scene.body import MOON, to_xyz
 from lommel.scene.camera import ReducedCamera
 from lommel.scene.grid import Grid, bounds_in, grid_from_bounds, read_crs
-from lommel.scene.masks import CLIPPED, MARGIN, MaskSettings, shadow_thresholds
+from lommel.scene.masks import CLIPPED, MARGIN, MaskSettings, shadow_thresholds, widened
 from lommel.scene.view import CameraView, OrthoView
 
 LEAST_SHARED = 8  # rows and columns of posts; a thinner sliver of an image tells no slope apart
@@ -130,7 +129,7 @@ def mask_views(views, settings):
     for (view, saturation), threshold in zip(views, thresholds, strict=True):
         is_used = (view.image > threshold) & (view.image < CLIPPED * saturation)
         # what lies beside shadow, clipping or no data holds part of it: read as slope, a scarp
-        is_used = binary_erosion(is_used, iterations=MARGIN, border_value=1)
+        is_used = ~widened(~is_used, MARGIN)
         if is_used.mean() >= LEAST_LIT:
             usable.append(view.with_image(np.where(is_used, view.image, np.float32(np.nan))))
             continue

@@ -6,7 +6,6 @@ The mask is the S of the albedo paper, the feathering its w. Most callers want `
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import binary_erosion
 
 MARGIN = 1  # pixels beside unusable ones that are left out
 CLIPPED = 0.98  # of the saturation value; interpolation lowers clipped pixels by this much
@@ -31,6 +30,32 @@ class MaskSettings:
     shadow_threshold: float | None = None
     max_incidence: float = np.radians(86.0)
     max_emission: float = np.radians(70.0)
+
+
+def widened(mask, steps=1):
+    """A mask grown by its four neighbours, so many times.
+
+    Parameters
+    ----------
+    mask : bool array (rows, cols)
+    steps : int
+
+    Returns
+    -------
+    mask : bool array (rows, cols)
+
+    Examples
+    --------
+    >>> widened(np.eye(3, dtype=bool))[0].tolist()
+    [True, True, False]
+    """
+    for _ in range(steps):
+        mask, last = mask.copy(), mask
+        mask[1:] |= last[:-1]
+        mask[:-1] |= last[1:]
+        mask[:, 1:] |= last[:, :-1]
+        mask[:, :-1] |= last[:, 1:]
+    return mask
 
 
 def lit_brightness(measured):
@@ -162,7 +187,7 @@ def pixel_weights(measured, cos_incidence, cos_emission, threshold, saturation, 
     has_value = np.isfinite(measured)
     usable = has_value & (measured > threshold) & (measured < CLIPPED * saturation)
     # pixels beside shadow, clipping or no data hold part of it
-    usable = binary_erosion(usable, iterations=MARGIN, border_value=1)
+    usable = ~widened(~usable, MARGIN)
     usable &= cos_incidence > np.cos(settings.max_incidence)
     usable &= cos_emission > np.cos(settings.max_emission)
     return np.where(usable, feathering(measured.shape, has_value), np.float32(0.0))
