@@ -13,6 +13,7 @@ import time
 from importlib.metadata import version
 from pathlib import Path
 
+from benchmarks.cameras import rates
 from benchmarks.convergence import REDUCTIONS, STRENGTHS, SingleImage, excess_cost, iterations
 from benchmarks.convergence import scaled as scaled_priors
 from benchmarks.scenes import Scene, make_scene
@@ -43,7 +44,7 @@ def main():
     parser.add_argument("--quick", action="store_true", help="small scenes only")
     parser.add_argument("--repeats", type=int, default=3, help="runs per scene; the fastest counts")
     parser.add_argument(
-        "--only", choices=("kernels", "scenes", "convergence"), help="one part of it"
+        "--only", choices=("kernels", "scenes", "convergence", "cameras"), help="one part of it"
     )
     options = parser.parse_args()
     sizes = QUICK_SIZES if options.quick else SIZES
@@ -59,6 +60,8 @@ def main():
         _print_scenes(scenes | OTHERS, options.repeats)
     if options.only in (None, "convergence"):
         _print_convergence([size for size in sizes if size in (256, 1024, 4096)])
+    if options.only in (None, "cameras"):
+        _print_cameras()
 
 
 def _print_machine():
@@ -82,6 +85,17 @@ def _print_kernels(sizes):
                 f"| {speed.bandwidth / 1e9:.1f} | {100 * share:.0f} % |",
                 flush=True,
             )
+
+
+def _print_cameras():
+    print("\n| what | million per second and core | on all cores | there and back px |")
+    print("|---" * 4 + "|")
+    for rate in rates():
+        print(
+            f"| {rate.name} | {rate.one_core / 1e6:.2f} | {rate.all_cores / 1e6:.2f} "
+            f"| {rate.worst:.1e} |",
+            flush=True,
+        )
 
 
 def _print_scenes(scenes, repeats):
