@@ -431,7 +431,7 @@ def test_camera_of_an_unknown_kind_is_an_error(raw, lommel):
     (raw / "q.xyz").write_text("")
     ended = lommel("sfs", "q.tif", *RAW[2:], "--cameras", "q.xyz")
     assert ended.status == 2
-    assert "q.xyz: no reader for cameras in .xyz files. Give one of .tsai" in ended.err
+    assert "q.xyz: no reader for cameras in .xyz files. Give one of .json, .isd, .tsai" in ended.err
 
 
 # --- Failures inside ------------------------------------------------------------------------------

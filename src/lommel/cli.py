@@ -45,8 +45,8 @@ CraftTable = Annotated[
 Cameras = Annotated[
     list[Path] | None,
     typer.Option(
-        help="Camera file (.tsai) of each image, in the same order; repeat. Default: the file "
-        "beside the image; without one the image is an orthoimage."
+        help="Camera file (ISD, .tsai, ISIS cube) of each image, in the same order; repeat. "
+        "Default: the file beside the image, or its own ISIS label; else it is an orthoimage."
     ),
 ]
 Unit = Annotated[str, typer.Option(help="Unit of the tables: auto, m or km.")]
@@ -287,17 +287,46 @@ def evaluate(
 
 @app.command()
 def info(
-    files: Annotated[list[Path], typer.Argument(help="Rasters.")],
+    files: Annotated[list[Path], typer.Argument(help="Images or other rasters.")],
     sun_positions: SunTable = None,
     spacecraft_positions: CraftTable = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    cameras: Cameras = None,
+    pixel: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            help="SAMPLE LINE of one image, 0.5 0.5 being the first pixel's centre: show the "
+            "ground point, and incidence, emission and phase there."
+        ),
+    ] = None,
+    dem: Annotated[
+        Path | None, typer.Option(help="DEM on which --pixel looks. Default: the sphere.")
+    ] = None,
+    as_json: Annotated[
+        bool,
+        typer.Option("--json", help="Print JSON: a list of objects, with --pixel one object."),
+    ] = False,
 ):
-    """Show what a raster holds: size, CRS, spacing, footprint; Sun and view with the tables."""
+    """Show what an image holds: size, place, spacing, camera; where Sun and spacecraft stand."""
+    from lommel.run.ground_point import describe_pixel
     from lommel.run.info import describe
 
-    facts = [describe(path, sun_positions, spacecraft_positions) for path in files]
+    named: list[Path | None] = [*cameras] if cameras else [None] * len(files)
+    if len(named) != len(files):
+        raise InputError(f"--cameras names {len(named)} files for {len(files)} images.")
+    if pixel is not None:
+        if len(files) > 1:
+            raise InputError(f"--pixel takes one image; {len(files)} are given.")
+        found = describe_pixel(files[0], *pixel, dem, named[0], sun_positions)
+        facts = [found]
+    else:
+        if dem is not None:
+            raise InputError("--dem tells where --pixel looks; give --pixel SAMPLE LINE too.")
+        found = facts = [
+            describe(path, sun_positions, spacecraft_positions, camera)
+            for path, camera in zip(files, named, strict=True)
+        ]
     if as_json:
-        typer.echo(json.dumps(facts, indent=1))
+        typer.echo(json.dumps(found, indent=1))
         return
     for fact in facts:
         for name, value in fact.items():

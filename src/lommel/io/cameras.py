@@ -5,26 +5,36 @@ Most callers want `find_camera` and `read_camera`.
 
 from pathlib import Path
 
-from lommel.errors import InputError
+from lommel.errors import InputError, LommelError
+from lommel.io.isd import is_isd, read_isd
+from lommel.io.isis import has_camera, read_isis
 from lommel.io.tsai import read_tsai
 
-READERS = {".tsai": read_tsai}
+READERS = {".json": read_isd, ".isd": read_isd, ".tsai": read_tsai}
 
 
 def find_camera(image):
-    """Path of the camera file beside an image, or None.
+    """Path of the file that holds an image's camera, or None.
 
     Parameters
     ----------
     image : Path
-        ``frame.tif`` has its camera in ``frame.tsai``.
+        ``frame.tif`` has its camera in ``frame.json`` or ``frame.isd`` (ISD), ``frame.tsai``, or,
+        when none of these exists, in its own ISIS label.
 
     Returns
     -------
     camera : Path or None
     """
-    beside = (Path(image).with_suffix(suffix) for suffix in READERS)
-    return next((path for path in beside if path.exists()), None)
+    image = Path(image)
+    for suffix in READERS:
+        path = image.with_suffix(suffix)
+        if path != image and path.exists() and (suffix != ".json" or is_isd(path)):
+            return path
+    try:
+        return image if has_camera(image) else None
+    except LommelError:
+        return None  # reported when the image is read
 
 
 def read_camera(path, shape):
@@ -40,10 +50,17 @@ def read_camera(path, shape):
     -------
     camera : Camera
     """
-    reader = READERS.get(Path(path).suffix.lower())
-    if reader is None:
+    path = Path(path)
+    reader = READERS.get(path.suffix.lower())
+    if reader is not None:
+        return reader(path, shape)
+    try:
+        is_cube = has_camera(path)
+    except LommelError:
+        is_cube = False
+    if not is_cube and path.suffix.lower() != ".cub":
         raise InputError(
-            f"{path}: no reader for cameras in {Path(path).suffix or 'nameless'} files. "
-            f"Give one of {', '.join(READERS)}."
+            f"{path}: no reader for cameras in {path.suffix or 'nameless'} files. "
+            f"Give one of {', '.join(READERS)}, or an ISIS cube after spiceinit."
         )
-    return reader(path, shape)
+    return read_isis(path, shape)

@@ -14,7 +14,7 @@ DECIMALS_DEG = 6  # 3 cm on the Moon
 DECIMALS_M = 3
 
 
-def describe(path, sun_positions=None, spacecraft_positions=None, body=MOON):
+def describe(path, sun_positions=None, spacecraft_positions=None, camera=None, body=MOON):
     """Facts about a raster, by name; names carry the unit.
 
     Parameters
