@@ -189,13 +189,17 @@ def backplanes(tile):
     planes : dict of str to array (rows, cols)
     """
     geometry = tile.geometry
-    shadow = np.where(tile.is_lit, LIT, SHADOW)
-    return {
-        "-incidence": np.degrees(np.arccos(geometry.cos_incidence)),
-        "-emission": np.degrees(np.arccos(geometry.cos_emission)),
-        "-phase": np.degrees(geometry.phase),
-        "-shadow": np.where(tile.is_on_image, shadow, UNKNOWN).astype(np.uint8),
+    angles = {
+        "-incidence": np.arccos(geometry.cos_incidence),
+        "-emission": np.arccos(geometry.cos_emission),
+        "-phase": geometry.phase,
     }
+    planes = {
+        suffix: np.where(tile.is_on_image, np.degrees(angle), np.nan)
+        for suffix, angle in angles.items()
+    }
+    shadow = np.where(tile.is_lit, LIT, SHADOW)
+    return planes | {"-shadow": np.where(tile.is_on_image, shadow, UNKNOWN)}
 
 
 def _blocks(grid):

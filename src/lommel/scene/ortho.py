@@ -28,7 +28,10 @@ class GroundTile:
     line, sample : array (rows, cols), px
         Image coordinates; NaN where the camera does not look.
     geometry : ViewingGeometry
-        NaN where the terrain is unknown, or off the image; incidence and phase also without a Sun.
+        NaN where the terrain is unknown; incidence and phase also without a Sun. Posts off the
+        image take Sun and camera from its nearest pixel.
+    is_on_image : bool array (rows, cols)
+        Known terrain that falls on the image, whether hidden or not.
     is_lit : bool array (rows, cols)
         Neither turned away from the Sun nor in the shadow of other terrain.
     is_seen : bool array (rows, cols)
@@ -38,13 +41,9 @@ class GroundTile:
     line: np.ndarray
     sample: np.ndarray
     geometry: ViewingGeometry
+    is_on_image: np.ndarray
     is_lit: np.ndarray
     is_seen: np.ndarray
-
-    @property
-    def is_on_image(self):
-        """True on posts that fall on the image, whether hidden or not."""
-        return np.isfinite(self.geometry.cos_emission)
 
 
 def ground_tile(grid, heights, window, camera, sun_position=None):
@@ -73,26 +72,23 @@ def ground_tile(grid, heights, window, camera, sun_position=None):
     normals = surface_normals(xyz)[inside]
     xyz = np.ascontiguousarray(xyz[inside])
     line, sample = camera.project(xyz)
-    is_on_image = camera.contains(line, sample)
-    # the middle stands in for posts off the image, which a moving camera never saw
-    middle = (camera.shape[0] / 2, camera.shape[1] / 2)
     pixel = [
-        np.where(is_on_image, place, m) for place, m in zip((line, sample), middle, strict=True)
+        np.clip(np.where(np.isfinite(place), place, size / 2), 0.0, size)
+        for place, size in zip((line, sample), camera.shape, strict=True)
     ]
     origin = camera.origin(*pixel)
     sun = _sun(camera, sun_position, pixel)
     geometry = viewing_geometry(xyz, normals, origin if sun is None else sun, origin)
+    is_on_image = camera.contains(line, sample) & np.isfinite(geometry.cos_emission)
     is_seen = is_on_image & (geometry.cos_emission > 0)
     if is_seen.any():
         is_seen &= sunlit(grid, heights, origin, window)
     is_lit = np.ones(window.shape, bool)
-    if sun is not None:
-        is_lit = geometry.cos_incidence > 0
-        is_lit &= sunlit(grid, heights, sun, window)
-    geometry.cos_emission[~is_on_image] = np.nan
-    for plane in (geometry.cos_incidence, geometry.phase):
-        plane[~is_on_image if sun is not None else ...] = np.nan
-    return GroundTile(line, sample, geometry, is_lit, is_seen)
+    if sun is None:
+        geometry.cos_incidence[:] = geometry.phase[:] = np.nan
+    else:
+        is_lit = (geometry.cos_incidence > 0) & sunlit(grid, heights, sun, window)
+    return GroundTile(line, sample, geometry, is_on_image, is_lit, is_seen)
 
 
 def _sun(camera, sun_position, pixel):
