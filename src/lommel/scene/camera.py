@@ -169,7 +169,8 @@ def focal_plane(focal_length, principal_point, to_pixels):
         )
     if not np.isfinite(principal_point).all():
         raise InputError(f"principal_point = {principal_point} is not finite, in pixels.")
-    if to_pixels.shape != (2, 2) or not 0 < np.abs(np.linalg.det(to_pixels)) < np.inf:
+    is_matrix = to_pixels.shape == (2, 2) and np.isfinite(to_pixels).all()
+    if not (is_matrix and np.linalg.matrix_rank(to_pixels) == 2):
         raise InputError(
             f"to_pixels = {to_pixels.tolist()} does not map the focal plane to lines and samples "
             "one to one. Check the detector's axes in the camera file."

@@ -27,6 +27,7 @@ from lommel.scene.line_scan_kernels import look_line_scan, project_line_scan
 from lommel.scene.motion import Pointing, Trajectory
 
 MARGIN = 64.0  # lines before the first and behind the last that are still projected
+MOST_LINES = 2_000_000  # 96 bytes each in the table of poses; the longest real strips have 1e5
 
 
 class Scan(NamedTuple):
@@ -73,6 +74,11 @@ class LineScanCamera(Camera):
 
     def __post_init__(self):
         """Check the table of lines, and that the other tables cover them."""
+        if self.shape[0] > MOST_LINES:
+            raise InputError(
+                f"the image has {self.shape[0]} lines; a line-scan camera may have {MOST_LINES}. "
+                "Cut the image."
+            )
         table = np.array(self.line_times, dtype=float)
         if table.ndim != 2 or table.shape[1:] != (3,) or not np.isfinite(table).all():
             raise InputError(
