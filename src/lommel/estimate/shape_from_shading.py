@@ -35,6 +35,7 @@ COARSEST = 24  # posts along the shorter side of the coarsest level that sees th
 COARSE_STEPS = 4  # Gauss-Newton steps per coarse level at most; 2 on the largest of them
 LARGE_IMAGE = 1_000_000  # cells, beyond which every fourth row and column tell a correlation
 SHORTEST_STEP = 0.1  # of a Gauss-Newton step: the cost that still rises has no way down
+EXPOSURE_GAIN = 1e-4  # relative, of the cost: exposures that gain less wait for the next step
 ROUNDING = 1e-5  # relative, of a cost summed from float32 residuals
 CELL_UNKNOWNS = 3  # two slopes and the albedo: what a cell's values determine
 POOR_FIT = 2.5  # noise standard errors, rms: more is not noise
@@ -252,7 +253,7 @@ def _descend(level, u, steps, settings, history):
             _look(level, start)
             return start, _is_small(np.float32(length) * direction, start, level, settings)
         level.albedo = here.albedo
-        if settings.estimate_exposure:
+        if settings.estimate_exposure and _exposures_are_off(here, level):
             _set_photometry(level, here.sums, settings)
             here = level.expand(u)
         step = _rms(u - start)
@@ -272,6 +273,12 @@ def _descend(level, u, steps, settings, history):
         if is_done or _is_small(u - start, u, level, settings):
             return u, True
     return u, False
+
+
+def _exposures_are_off(here, level):
+    """True where better exposures lower the cost by more than rounding and noise of the fit."""
+    gain = exposure_gain(here.sums, level.exposures, level.hazes)
+    return gain / 2 > EXPOSURE_GAIN * abs(here.cost)
 
 
 def _is_small(step, u, level, settings):

@@ -24,7 +24,6 @@ computed on a lattice of nodes and interpolated in between. Most callers want `S
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from lommel.scene.body import to_xyz, up_vector
 from lommel.scene.geometry import unit
@@ -184,6 +183,8 @@ class Surface:
 
     def _slide(self, field, sign):
         """Solve ``v(x) = field(x + sign drift v(x))`` or its inverse by fixed-point steps."""
+        from scipy.ndimage import map_coordinates  # takes as long to import as all the rest here
+
         rows, cols = field.shape
         lattice = self.lattice(field.shape, 1, np.linalg.norm(self.camera_position) / 20)
         drift = self.frame(lattice, np.zeros((lattice.row.size, lattice.col.size))).drift
