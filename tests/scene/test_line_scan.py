@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -86,6 +88,19 @@ def test_line_times_may_change_and_run_backwards(line_times, pixels):
     camera = camera_of(DISTORTIONS["lrolrocnac"], line_times)
     found = camera.project(ground_of(camera, *pixels))
     np.testing.assert_allclose(found, pixels, rtol=0, atol=PIXEL)
+
+
+def test_ephemeris_time_does_not_shake_the_lines(pixels):
+    """A double of 3e8 s steps by 6e-8 s: an orbiter moves by a ten-thousandth of a line."""
+    early, epoch = camera_of(), 3.4e8
+    camera = replace(
+        early,
+        trajectory=early.trajectory.since(-epoch),
+        pointing=early.pointing.since(-epoch),
+        line_times=np.array([[0.0, epoch, PERIOD]]),
+    )
+    found = camera.project(ground_of(camera, *pixels))
+    np.testing.assert_allclose(found, pixels, rtol=0, atol=1e-6)
 
 
 def test_detector_turned_round_sees_the_same_lines(pixels):

@@ -109,9 +109,10 @@ class LineScanCamera(Camera):
     @cached_property
     def _scan(self):
         lines = np.arange(-MARGIN, self.shape[0] + MARGIN + 1)
-        times = self.time(lines)
-        rotations = self.pointing.at(times).reshape(-1, 9)
-        poses = np.concatenate([self.trajectory.at(times), rotations], axis=1)
+        times = self._since_epoch(lines)
+        positions = self.trajectory.since(self._epoch).at(times)
+        rotations = self.pointing.since(self._epoch).at(times)
+        poses = np.concatenate([positions, rotations.reshape(-1, 9)], axis=1)
         return Scan(float(lines[0]), float(lines[-1]), poses)
 
     def time(self, line):
@@ -125,29 +126,41 @@ class LineScanCamera(Camera):
         -------
         time : array (...), s
         """
+        return self._epoch + self._since_epoch(line)
+
+    @property
+    def _epoch(self):
+        """Time of the first rate: ephemeris times are only good to 6e-8 s, or 0.1 mm of flight."""
+        return self.line_times[0, 1]
+
+    def _since_epoch(self, line):
         line = np.asarray(line, float)
         firsts, times, periods = self.line_times.T
         row = np.maximum(np.searchsorted(firsts, line, side="right") - 1, 0)
-        return times[row] + (line - firsts[row]) * periods[row]
+        return times[row] - self._epoch + (line - firsts[row]) * periods[row]
 
     @cached_property
     def position(self):
         """Perspective centre at the middle line, body-fixed, m."""
-        return self.trajectory.at(self._middle_time)
+        return self.origin(self._middle, 0.0)
 
     @cached_property
     def rotation(self):
         """From body-fixed axes to the camera frame at the middle line."""
-        return self.pointing.at(self._middle_time)
+        return self.pointing.at(self.time(self._middle))
 
     @cached_property
     def sun_position(self):
         """Of the Sun at the middle line, body-fixed, m; None when nothing is known of it."""
-        return None if self.sun_trajectory is None else self.sun_trajectory.at(self._middle_time)
+        return (
+            None
+            if self.sun_trajectory is None
+            else self._along(self.sun_trajectory, self._middle, 0.0)
+        )
 
     @property
-    def _middle_time(self):
-        return self.time(self.shape[0] / 2)
+    def _middle(self):
+        return self.shape[0] / 2
 
     @property
     def _lens(self):
@@ -180,12 +193,13 @@ class LineScanCamera(Camera):
 
     def sun(self, line, sample):
         """Position of the Sun when pixels were taken; see `Camera.sun`."""
-        self._known_sun()
+        self._known_sun()  # or an error
         return self._along(self.sun_trajectory, line, sample)
 
     def _along(self, trajectory, line, sample):
         shape = np.broadcast(line, sample).shape
-        return np.broadcast_to(trajectory.at(self.time(np.broadcast_to(line, shape))), (*shape, 3))
+        times = self._since_epoch(np.broadcast_to(line, shape))
+        return trajectory.since(self._epoch).at(times)
 
     def adjusted(self, rotation, shift):
         """The same camera, turned and moved alike at all lines; see `Camera.adjusted`."""

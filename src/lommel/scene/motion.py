@@ -64,6 +64,10 @@ class Trajectory:
             return self.positions[0] + (times - self.times[0])[..., None] * self.velocities[0]
         return CubicHermiteSpline(self.times, self.positions, self.velocities)(times)
 
+    def since(self, epoch):
+        """The same trajectory with times counted from an epoch."""
+        return replace(self, times=self.times - epoch)
+
     def shifted(self, shift):
         """The same trajectory elsewhere; shift (3,) in m."""
         return replace(self, positions=self.positions + np.asarray(shift, float))
@@ -118,6 +122,10 @@ class Pointing:
         turns = (nodes[1:] * nodes[:-1].inv()).as_rotvec()
         turned = Rotation.from_rotvec(share[:, None] * turns[i]) * nodes[i]
         return turned.as_matrix().reshape(*times.shape, 3, 3)
+
+    def since(self, epoch):
+        """The same pointing with times counted from an epoch."""
+        return replace(self, times=self.times - epoch)
 
     def turned(self, rotation):
         """The same pointing after a constant rotation (3, 3) in the camera frame."""
