@@ -404,7 +404,7 @@ def test_request_for_raw_images_that_cannot_work_is_an_error(raw, lommel, reques
 def test_raw_images_need_a_sun(raw, lommel):
     ended = lommel("sfs", *RAW[:-2])
     assert ended.status == 2
-    assert "The camera files do not tell where the Sun stood. Name a table" in ended.err
+    assert "the camera file does not tell where the Sun stood. Name a table" in ended.err
     (raw / "sun.txt").write_text("x 1.5e11 0 0\n")
     assert "sun.txt has no entry for p.tif" in lommel("sfs", *RAW).err
 

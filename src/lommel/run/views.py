@@ -86,7 +86,7 @@ def read_views(files, grid_settings=None, masks=None, body=MOON, progress=iter):
     else:
         grid = _terrain_grid(files.dems, cameras, grid_settings, body)
         heights = read_heights(files.dems, grid, body)
-    suns = _sun_table(files, body) if cameras else {}
+    suns = _sun_table(files, body) if cameras else None
     for path in progress(list(cameras)) if cameras else ():
         try:
             views.append(_camera_view(path, cameras[path], suns, files, grid, heights, body))
@@ -224,7 +224,14 @@ def _camera_view(path, camera_path, suns, files, grid, heights, body):
     factor = int(min(grid.spacing) / gsd + 0.5) if np.isfinite(gsd) else 1
     if factor > 1:  # finer pixels than posts: their means are what the cells can explain
         image, camera = _reduce(image, factor), ReducedCamera(camera, factor)
-    sun = find_position(suns, path.name, files.sun_positions)
+    sun = camera.sun_position
+    if sun is None and suns is None:
+        raise InputError(
+            f"{path.name}: the camera file does not tell where the Sun stood. Name a table of "
+            "lines KEY x y z with --sun-positions."
+        )
+    if sun is None:
+        sun = find_position(suns, path.name, files.sun_positions)
     return CameraView(path.name, image, camera, sun), raster_info(path, body).saturation
 
 
@@ -235,9 +242,7 @@ def _reduce(image, factor):
 
 
 def _sun_table(files, body):
+    """The table of Sun positions for cameras that know none; None when there is no table."""
     if files.sun_positions is None:
-        raise InputError(
-            "The camera files do not tell where the Sun stood. Name a table of lines KEY x y z "
-            "with --sun-positions."
-        )
+        return None
     return read_positions(files.sun_positions, "sun", body, files.positions_unit)
