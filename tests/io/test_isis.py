@@ -362,22 +362,19 @@ def test_line_scan_image_at_impossible_times_is_an_error(tmp_path, changes, mess
 
 
 def test_label_of_ten_megabytes_is_read(tmp_path):
-    """Its tables lie behind it; nothing but the label is read for the camera."""
-    filler = (
-        " Group = Padding\n"
-        + "".join(f"  K{i} = {'x' * 80}\n" for i in range(100))
-        + " End_Group\n"
-    )
     path = write_cube(tmp_path / "a.cub")
+    expected = metric(path)
     data = path.read_bytes()
-    grown = 10 * 2**20
-    shift = grown - LABEL_BYTES
+    keys = "".join(f"  K{i} = {'x' * 1000}\n" for i in range(10_000))
     end = data.index(b"End_Object\nObject = Label")
-    label = data[:end] + filler.encode() + data[end:LABEL_BYTES].rstrip(b"\0")
-    for number in sorted({int(part.split()[0]) for part in label.split(b"StartByte = ")[1:]})[::-1]:
-        label = label.replace(b"StartByte = %d\n" % number, b"StartByte = %d\n" % (number + shift))
-    path.write_bytes(label.ljust(grown, b" ") + data[LABEL_BYTES:])
-    expected = metric(write_cube(tmp_path / "b.cub"))
+    label = data[:end] + f" Group = Padding\n{keys} End_Group\n".encode()
+    label += data[end:LABEL_BYTES].rstrip(b"\0")
+    grown = len(label) + 100
+    for start in sorted({int(part.split()[0]) for part in label.split(b"StartByte = ")[1:]})[::-1]:
+        moved = start + grown - LABEL_BYTES
+        label = label.replace(b"StartByte = %d\n" % start, b"StartByte = %d\n" % moved)
+    label = label.replace(b"Bytes = %d\n" % LABEL_BYTES, b"Bytes = %d\n" % grown)
+    path.write_bytes(label.ljust(grown) + data[LABEL_BYTES:])
     np.testing.assert_array_equal(metric(path).rotation, expected.rotation)
 
 
