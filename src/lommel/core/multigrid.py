@@ -26,6 +26,7 @@ from lommel.core.normal_operator import (
     coarse_shape,
     coarsen_cells,
     inverse_diagonal,
+    prolong,
     prolong_add,
     restrict,
 )
@@ -40,6 +41,7 @@ SMALLEST = 5  # posts along the shorter side below which the level is solved dir
 # Levels of the V-cycle that feel the terms of longer waves: those on which these terms weigh
 # against the slopes. Above, they would cost as much as they save.
 LONG_WAVES_FROM = 2
+NORMALISED = np.float32(0.25)  # the nine weights of `restrict` sum to four
 SERIAL_POSTS = 64 * 1024  # below it a parallel loop costs more than it saves
 
 
@@ -138,26 +140,24 @@ class NormalEquations:
         x : float32 array (rows, cols)
             A work array: it is overwritten by the next call.
         """
-        np.copyto(self.levels[0].residual, right_hand_side)
-        self._cycle(0)
+        self._cycle(0, right_hand_side)
         return self.levels[0].x
 
-    def _cycle(self, depth):
+    def _cycle(self, depth, right_hand_side):
         level = self.levels[depth]
         if depth == len(self.levels) - 1:
-            np.copyto(level.x, (self._inverse @ level.residual.ravel()).reshape(level.shape))
+            np.copyto(level.x, (self._inverse @ right_hand_side.ravel()).reshape(level.shape))
             return
         coarse = self.levels[depth + 1]
         with threads_for(level.shape):
-            _smooth(level, starts_at_zero=True)
+            _smooth_from_zero(level, right_hand_side)
             restrict(level.residual, coarse.residual)
-        self._cycle(depth + 1)
+        self._cycle(depth + 1, coarse.residual)
         with threads_for(level.shape):
-            level.step[:] = 0.0
-            prolong_add(coarse.x, level.step)
+            prolong(coarse.x, level.step)
             level.apply(level.step, level.image)
             _take_step(level.x, level.residual, level.step, level.image, np.float32(1))
-            _smooth(level, starts_at_zero=False)
+            _smooth_last(level)
 
 
 @dataclass(frozen=True)
@@ -237,26 +237,46 @@ def add_long_waves(u, masses, out):
     energy : float
         The sum of m_l |S_l u|^2.
     """
-    lows = [u]
-    for _ in masses[1:]:
-        low = np.empty(coarse_shape(lows[-1].shape), np.float32)
-        with threads_for(lows[-1].shape):
-            restrict(lows[-1], low)
-        low *= np.float32(0.25)  # the nine weights of `restrict` sum to four
-        lows.append(low)
-    energy = sum(mass * dot(low, low) for mass, low in zip(masses, lows, strict=True) if mass)
-    total = None
-    for mass, low in zip(masses[:0:-1], lows[:0:-1], strict=True):
-        own = np.float32(mass) * low
-        if total is not None:
-            with threads_for(own.shape):
-                prolong_add(total, own)
-        total = np.float32(0.25) * own
-    if total is not None:
-        with threads_for(out.shape):
-            prolong_add(total, out)
+    masses = np.asarray(masses, float)
+    if u.size < SERIAL_POSTS:
+        with threads_for(u.shape):
+            return _add_long_waves(u, masses, out)
+    energy = 0.0
     if masses[0]:
+        energy = masses[0] * dot(u, u)
         out += np.float32(masses[0]) * u
+    if masses[1:].any():
+        low = np.empty(coarse_shape(u.shape), np.float32)
+        restrict(u, low)
+        low *= NORMALISED
+        pull = np.zeros_like(low)
+        energy += add_long_waves(low, masses[1:], pull)
+        pull *= NORMALISED
+        prolong_add(pull, out)
+    return energy
+
+
+@njit(cache=True)
+def _add_long_waves(u, masses, out):
+    """The same for a small array, without the way back to Python between levels."""
+    lows = [u]
+    for _ in range(masses.size - 1):
+        fine = lows[-1]
+        low = np.empty(((fine.shape[0] + 2) // 2, (fine.shape[1] + 2) // 2), np.float32)
+        restrict(fine, low)
+        low *= NORMALISED
+        lows.append(low)
+    energy, total = 0.0, np.zeros_like(lows[-1])
+    for level in range(masses.size - 1, -1, -1):
+        low, mass = lows[level], masses[level]
+        pull = out if level == 0 else np.zeros_like(low)
+        if level < masses.size - 1:
+            total *= NORMALISED
+            prolong_add(total, pull)
+        if mass > 0:
+            energy += mass * _block_dots(low, low).sum()
+            pull += np.float32(mass) * low
+        total = pull
     return energy
 
 
@@ -337,35 +357,74 @@ def _dense_inverse(level):
     return inverse.astype(np.float32)
 
 
-def _smooth(level, starts_at_zero):
-    """Chebyshev iteration on the upper spectrum; updates ``x`` and ``residual`` of the level."""
-    upper, left = LARGEST_EIGENVALUE, LEFT_SHARE / level.degree**2
+def _smooth_from_zero(level, right_hand_side):
+    """Chebyshev iteration on the upper spectrum, which makes ``x`` and ``residual``."""
+    (_, scale), *later = _chebyshev(level.degree)
+    _first_step(level.x, level.step, right_hand_side, level.inverse_diagonal, scale)
+    level.apply(level.step, level.image)
+    _difference(right_hand_side, level.image, level.residual)
+    for keep, scale in later:
+        _redirect_scaled(level.step, level.residual, level.inverse_diagonal, keep, scale)
+        level.apply(level.step, level.image)
+        _take_step(level.x, level.residual, level.step, level.image, np.float32(1))
+
+
+def _smooth_last(level):
+    """The same from where ``x`` is; the last step leaves ``residual``, which nobody asks for."""
+    *earlier, (keep, scale) = _chebyshev(level.degree)
+    for keep_more, scale_more in earlier:
+        _redirect_scaled(level.step, level.residual, level.inverse_diagonal, keep_more, scale_more)
+        level.apply(level.step, level.image)
+        _take_step(level.x, level.residual, level.step, level.image, np.float32(1))
+    _last_step(level.x, level.step, level.residual, level.inverse_diagonal, keep, scale)
+
+
+def _chebyshev(degree):
+    """What each step keeps of the last one, and the factor of the scaled residual in it."""
+    upper, left = LARGEST_EIGENVALUE, LEFT_SHARE / degree**2
     middle, half = upper * (1 + left) / 2, upper * (1 - left) / 2
     sigma = middle / half
     rho = 1.0 / sigma
-    if starts_at_zero:
-        level.x[:] = 0.0
-    keep, scale = 0.0, 1.0 / middle
-    for _ in range(level.degree):
-        _chebyshev_direction(
-            level.step, level.residual, level.inverse_diagonal, np.float32(keep), np.float32(scale)
-        )
-        level.apply(level.step, level.image)
-        _take_step(level.x, level.residual, level.step, level.image, np.float32(1))
+    steps = [(np.float32(0), np.float32(1.0 / middle))]
+    while len(steps) < degree:
         next_rho = 1.0 / (2.0 * sigma - rho)
-        keep, scale, rho = next_rho * rho, 2.0 * next_rho / half, next_rho
+        steps.append((np.float32(next_rho * rho), np.float32(2.0 * next_rho / half)))
+        rho = next_rho
+    return steps
 
 
 @njit(cache=True, parallel=True, fastmath={"contract", "nsz"})
-def _chebyshev_direction(step, residual, inverse_diagonal, keep, scale):
+def _first_step(x, step, right_hand_side, inverse_diagonal, scale):
+    for i in prange(x.shape[0]):
+        a, s, r, d = x[i], step[i], right_hand_side[i], inverse_diagonal[i]
+        for c in range(a.size):
+            s[c] = scale * d[c] * r[c]
+        for c in range(a.size):
+            a[c] = s[c]
+
+
+@njit(cache=True, parallel=True, fastmath={"contract", "nsz"})
+def _difference(a, b, out):
+    for i in prange(out.shape[0]):
+        x, y, z = a[i], b[i], out[i]
+        for c in range(z.size):
+            z[c] = x[c] - y[c]
+
+
+@njit(cache=True, parallel=True, fastmath={"contract", "nsz"})
+def _last_step(x, step, residual, inverse_diagonal, keep, scale):
+    for i in prange(x.shape[0]):
+        a, s, r, d = x[i], step[i], residual[i], inverse_diagonal[i]
+        for c in range(a.size):
+            a[c] += keep * s[c] + scale * d[c] * r[c]
+
+
+@njit(cache=True, parallel=True, fastmath={"contract", "nsz"})
+def _redirect_scaled(step, residual, inverse_diagonal, keep, scale):
     for i in prange(step.shape[0]):
         s, r, d = step[i], residual[i], inverse_diagonal[i]
-        if keep == np.float32(0.0):
-            for c in range(s.size):
-                s[c] = scale * d[c] * r[c]
-        else:
-            for c in range(s.size):
-                s[c] = keep * s[c] + scale * d[c] * r[c]
+        for c in range(s.size):
+            s[c] = keep * s[c] + scale * d[c] * r[c]
 
 
 @njit(cache=True, parallel=True, fastmath={"contract", "nsz"})

@@ -312,3 +312,14 @@ def prolong_add(coarse, fine):
         near, far = coarse[r // 2], coarse[(r + 1) // 2]
         row = fine[r]
         _add_interleaved(near, far, row)
+
+
+@njit(cache=True, parallel=True)
+def prolong(coarse, fine):
+    """Interpolate coarse posts bilinearly to the fine ones."""
+    for i in prange(fine.shape[0]):
+        r = np.int64(i)
+        row = fine[r]
+        for c in range(row.size):
+            row[c] = np.float32(0.0)
+        _add_interleaved(coarse[r // 2], coarse[(r + 1) // 2], row)

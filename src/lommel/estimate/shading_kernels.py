@@ -188,6 +188,15 @@ def _eliminate_albedo(albedo, precision, w, n, best):
 
 
 @njit(cache=True, nogil=True)
+def _start(slope, w, n):
+    for k in range(GPP, BUFFER):
+        w[k] = np.float32(0.0)
+    for c in range(n):
+        w[GPP + c] = slope[0]
+        w[GQQ + c] = slope[1]
+
+
+@njit(cache=True, nogil=True)
 def _copy(w, start, out, n):
     for c in range(n):
         out[c] = w[start + c]
@@ -269,9 +278,7 @@ def assemble(
                 a, n = j * step, min(step, cols - j * step)
                 _lines(gram, node, t, j, np.float32(step), gram_lines)
                 _normals(u[r, a:], u[r + 1, a:], gram_lines, inverse_row, inverse_col, w, n)
-                w[GPP:] = np.float32(0.0)
-                w[GPP : GPP + n] = slope[0]
-                w[GQQ : GQQ + n] = slope[1]
+                _start(slope, w, n)
                 for k in range(count):
                     _lines(lights[k], node, t, j, np.float32(step), light_lines)
                     _cosines(light_lines, w, n)

@@ -33,7 +33,7 @@ from lommel.estimate.shading_kernels import SUM_COUNT, SUM_RR
 
 COARSEST = 24  # posts along the shorter side of the coarsest level that sees the images
 COARSE_STEPS = 4  # Gauss-Newton steps per coarse level at most; 2 on the largest of them
-LARGE_IMAGE = 1_000_000  # cells, beyond which every fourth row and column tell a correlation
+ENOUGH_CELLS = 100_000  # of them tell a correlation to (1 - r^2) 0.3 %
 SHORTEST_STEP = 0.1  # of a Gauss-Newton step: the cost that still rises has no way down
 EXPOSURE_GAIN = 1e-4  # relative, of the cost: exposures that gain less wait for the next step
 ROUNDING = 1e-5  # relative, of a cost summed from float32 residuals
@@ -199,8 +199,8 @@ def separation(level, u):
 
 
 def correlation(measured, modelled):
-    """Correlation of two images over the cells both have; of every fourth one in large images."""
-    stride = 1 if measured.size < LARGE_IMAGE else 4
+    """Correlation of two images over the cells both have; large ones are thinned out evenly."""
+    stride = max(int((measured.size / ENOUGH_CELLS) ** 0.5), 1)
     pair = np.stack([image[::stride, ::stride].ravel() for image in (measured, modelled)])
     pair = pair[:, np.isfinite(pair).all(axis=0)].astype(float)
     return float(np.corrcoef(pair)[0, 1])
