@@ -183,7 +183,7 @@ def pointing(camera, body):
     -------
     pointing : Pointing
     """
-    times = np.union1d(camera.times, body.times) if camera.times.size > 1 else camera.times
+    times = _times_of_both(camera, body)
     return Pointing(times, camera.at(times) @ np.swapaxes(body.at(times), -1, -2))
 
 
@@ -199,5 +199,11 @@ def trajectory(place, body):
     -------
     trajectory : Trajectory
     """
-    times = np.union1d(place.times, body.times)
+    times = _times_of_both(place, body)
     return Trajectory(times, *body.carried(place.spline(times), place.velocity(times), times))
+
+
+def _times_of_both(table, body):
+    """Times of a table, and between them those of the body's rotation."""
+    inner = (body.times > table.times[0]) & (body.times < table.times[-1])
+    return np.union1d(table.times, body.times[inner]) if body.times.size > 1 else table.times

@@ -10,22 +10,26 @@ detector's line 0 + start, and its centre was exposed at
 :math:`t_c + t_i + \tau_i (line - line_i + 1/2)`, one row (line_i, t_i, tau_i) of
 ``line_scan_rate`` per rate. These relations are usgscsm's (``Utilities.cpp``,
 ``UsgsAstroLsSensorModel.cpp``); as there, lines of sight are (x, y, f) in the camera frame.
-Most callers want `read_isd`; `lommel.io.isd_writer` writes such files.
+Most callers want `read_isd` and `write_isd`.
 """
 
 import json
-import re
+import os
+from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from lommel.errors import InputError
-from lommel.io.inertial import KM, from_quaternions, pointing, positions, rotations, trajectory
+from lommel.io.inertial import KM, pointing, trajectory
+from lommel.io.isd_values import load_isd
 from lommel.io.sensors import FLIP, apollo_metric
+from lommel.scene.body import MOON
 from lommel.scene.camera import FrameCamera
 from lommel.scene.distortion import Distortion
 from lommel.scene.line_scan import LineScanCamera
 
-SIZE_LIMIT = 128 * 2**20  # bytes; a NAC image of 52 224 lines with entries per line has 27 MB
 FRAME, LINE_SCAN = "USGS_ASTRO_FRAME_SENSOR_MODEL", "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
 KEYS = {  # of `optical_distortion`: lommel's model, where its coefficients stand, how many at most
     "radial": ("radial", ("coefficients",), (3,)),
@@ -40,7 +44,7 @@ KEYS = {  # of `optical_distortion`: lommel's model, where its coefficients stan
 def is_isd(path):
     """True when a file is JSON with the name of a CSM sensor model."""
     try:
-        return "name_model" in _load(path)
+        return "name_model" in load_isd(path).values
     except InputError:
         return False
 
@@ -58,7 +62,7 @@ def read_isd(path, shape):
     -------
     camera : FrameCamera or LineScanCamera
     """
-    isd = _Isd(path, _load(path))
+    isd = load_isd(path)
     model = isd.text("name_model")
     if model not in MODELS:
         raise InputError(
@@ -76,95 +80,8 @@ def read_isd(path, shape):
 
 def isd_shape(path):
     """Lines and samples of the image that an ISD belongs to."""
-    isd = _Isd(path, _load(path))
+    isd = load_isd(path)
     return isd.whole("image_lines"), isd.whole("image_samples")
-
-
-def _load(path):
-    try:
-        with open(path, "rb") as file:
-            data = file.read(SIZE_LIMIT + 1)
-        if len(data) > SIZE_LIMIT:
-            raise InputError(f"{path} has more than {SIZE_LIMIT} bytes; no ISD has.")
-        isd = json.loads(data)
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path} cannot be read as an ISD (JSON): {error}") from error
-    if not isinstance(isd, dict):
-        raise InputError(f"{path} is JSON, but not an ISD: it holds no keys.")
-    return isd
-
-
-class _Isd:
-    """The JSON of an ISD, asked for values of a kind."""
-
-    def __init__(self, path, values):
-        self.path, self.values = path, values
-
-    def part(self, key):
-        """A nested object."""
-        part = self.values.get(key)
-        if not isinstance(part, dict):
-            raise InputError(
-                f"{self.path}: {key} is missing or no object. Write the ISD again with "
-                "isd_generate of ALE 0.8.6 or newer."
-            )
-        return _Isd(f"{self.path}: {key}", part)
-
-    def array(self, key, *shape):
-        """Finite numbers of a shape; None stands for any length."""
-        try:
-            array = np.array(self.values.get(key), dtype=float)
-        except (TypeError, ValueError, OverflowError):
-            array = np.full((), np.nan)
-        fits = array.ndim == len(shape) and all(
-            want is None or size == want for size, want in zip(array.shape, shape, strict=True)
-        )
-        if not fits or not np.isfinite(array).all():
-            sizes = " x ".join("n" if size is None else str(size) for size in shape) or "one"
-            raise InputError(
-                f"{self.path}: {key} = {str(self.values.get(key))[:60]} is not {sizes} finite "
-                f"number{'s' if shape else ''}."
-            )
-        return array
-
-    def number(self, key):
-        return float(self.array(key))
-
-    def whole(self, key):
-        number = self.number(key)
-        if number != int(number) or number < 1:
-            raise InputError(f"{self.path}: {key} = {number} is not a count.")
-        return int(number)
-
-    def text(self, key):
-        value = self.values.get(key, "")
-        return value if isinstance(value, str) else str(value)
-
-    def naif(self, key, count):
-        """Numbers of the one instrument in ``naif_keywords``."""
-        name = next((name for name in self.values if re.fullmatch(rf"INS-\d+_{key}", name)), key)
-        return np.atleast_1d(self.array(name, count) if count > 1 else self.array(name))
-
-    def rotations(self):
-        times = self.array("ephemeris_times", None)
-        matrices = from_quaternions(self.array("quaternions", times.size, 4), self.path)
-        constant = np.eye(3)
-        if "constant_rotation" in self.values:
-            constant = self.array("constant_rotation", 9).reshape(3, 3)
-        return rotations(times, matrices, constant, self.path)
-
-    def positions(self):
-        times = self.array("ephemeris_times", None)
-        velocities = None
-        if self.values.get("velocities") is not None:
-            velocities = KM * self.array("velocities", times.size, 3)
-        places = KM * self.array("positions", times.size, 3)
-        return positions(times, places, velocities, name=self.path)
-
-    def sun(self, body):
-        if "sun_position" not in self.values:
-            return None
-        return trajectory(self.part("sun_position").positions(), body)
 
 
 def _interior(isd):
@@ -254,3 +171,136 @@ def _line_scan(isd, shape):
 
 
 MODELS = {FRAME: _frame, LINE_SCAN: _line_scan}
+
+
+def write_isd(path, camera, body=MOON):
+    """Write the ISD of a camera, as ALE lays it out; the file appears whole or not at all.
+
+    Positions and rotations are written in the body's axes, at the times of the camera's own tables,
+    with a body rotation that does nothing; `read_isd` gives the same projections back. usgscsm
+    takes tables for evenly spaced, which those of an ISIS cube are not.
+
+    Parameters
+    ----------
+    path : path
+    camera : FrameCamera or LineScanCamera
+    body : Body
+    """
+    path = Path(path)
+    if isinstance(camera, FrameCamera):
+        parts = _frame_parts(camera)
+    elif isinstance(camera, LineScanCamera):
+        parts = _line_scan_parts(camera)
+    else:
+        raise InputError(
+            f"{path}: a {type(camera).__name__} has no ISD. Write the camera of the image as it "
+            "was taken."
+        )
+    radius = body.radius / KM
+    focal_length, to_pixels, distortion = _written_plane(path, camera)
+    isd = {
+        "isis_camera_version": 2,
+        "image_lines": camera.shape[0],
+        "image_samples": camera.shape[1],
+        "name_platform": "unknown",
+        "name_sensor": "unknown",
+        "reference_height": {"maxheight": 1000, "minheight": -1000, "unit": "m"},
+        "radii": {"semimajor": radius, "semiminor": radius, "unit": "km"},
+        **parts,
+        "naif_keywords": {},
+        "detector_sample_summing": 1,
+        "detector_line_summing": 1,
+        "focal_length_model": {"focal_length": focal_length},
+        "detector_center": {
+            "line": float(camera.principal_point[0]),
+            "sample": float(camera.principal_point[1]),
+        },
+        "focal2pixel_lines": [0.0, *to_pixels[0].tolist()],
+        "focal2pixel_samples": [0.0, *to_pixels[1].tolist()],
+        "optical_distortion": distortion,
+        "starting_detector_line": 0,
+        "starting_detector_sample": 0,
+    }
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_text(json.dumps(isd, indent=1, allow_nan=False), encoding="utf-8")
+        os.replace(partial, path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error}") from error
+    finally:
+        with suppress(OSError):
+            partial.unlink()
+
+
+def _frame_parts(camera):
+    sun = camera.sun_position
+    return {
+        "name_model": FRAME,
+        "center_ephemeris_time": 0.0,
+        "body_rotation": _rotation_table([0.0], np.eye(3)[None]),
+        "instrument_pointing": _rotation_table([0.0], camera.rotation[None]),
+        "instrument_position": _position_table([0.0], camera.position[None], np.zeros((1, 3))),
+    } | ({} if sun is None else {"sun_position": _position_table([0.0], sun[None])})
+
+
+def _line_scan_parts(camera):
+    start, end = camera.time([0.0, camera.shape[0]])
+    middle = float((start + end) / 2)
+    place, sun = camera.trajectory, camera.sun_trajectory
+    rates = camera.line_times + [0.5, -middle, 0.0]
+    parts = {
+        "name_model": LINE_SCAN,
+        "interpolation_method": "lagrange",
+        "line_scan_rate": rates.tolist(),
+        "starting_ephemeris_time": float(start),
+        "center_ephemeris_time": middle,
+        "body_rotation": _rotation_table([middle], np.eye(3)[None]),
+        "instrument_pointing": _rotation_table(camera.pointing.times, camera.pointing.rotations),
+        "instrument_position": _position_table(place.times, place.positions, place.velocities),
+    }
+    if sun is not None:
+        parts["sun_position"] = _position_table(sun.times, sun.positions, sun.velocities)
+    return parts
+
+
+def _rotation_table(times, matrices):
+    return {
+        **_cover("ck", times),
+        "quaternions": np.roll(Rotation.from_matrix(matrices).as_quat(), 1, axis=1).tolist(),
+        "constant_rotation": np.eye(3).ravel().tolist(),
+        "reference_frame": 1,
+    }
+
+
+def _position_table(times, places, velocities=None):
+    table = {**_cover("spk", times), "positions": (places / KM).tolist(), "reference_frame": 1}
+    return table if velocities is None else table | {"velocities": (velocities / KM).tolist()}
+
+
+def _cover(kind, times):
+    times = np.asarray(times, float).tolist()
+    return {
+        f"{kind}_table_start_time": times[0],
+        f"{kind}_table_end_time": times[-1],
+        f"{kind}_table_original_size": len(times),
+        "ephemeris_times": times,
+    }
+
+
+def _written_plane(path, camera):
+    """Focal length, matrix to pixels and distortion, in the unit of the distortion's model."""
+    focal_length, to_pixels = float(camera.focal_length), np.array(camera.to_pixels, float)
+    lens = camera.distortion
+    if lens is None or lens.model == "none":
+        return focal_length, to_pixels, {"radial": {"coefficients": [0.0, 0.0, 0.0]}}
+    if lens.model == "radtan":  # counts in focal lengths, whatever the plane's unit
+        if not np.isclose(lens.unit, focal_length, rtol=1e-12):
+            raise InputError(f"{path}: an ISD has radtan coefficients in focal lengths only.")
+    else:
+        focal_length, to_pixels = focal_length / lens.unit, to_pixels * lens.unit
+    _, names, counts = KEYS[lens.model]
+    rest, part = list(lens.coefficients), {}
+    for name, count in zip(names, counts, strict=True):
+        part[name] = rest[0] if name.startswith("boresight") else rest[:count]
+        rest = rest[count:]
+    return focal_length, to_pixels, {lens.model: part}
