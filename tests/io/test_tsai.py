@@ -26,6 +26,17 @@ GOOD = {
     "R": " ".join(repr(float(value)) for value in ROTATION.T.ravel()),
     "pitch": "0.005",
 }
+TSAI = {"k1": "-0.1", "k2": "0.05", "p1": "1e-3", "p2": "-2e-3"}
+BROWN_CONRADY = {
+    "xp": "-0.006",
+    "yp": "-0.002",
+    "k1": "-0.13361854e-5",
+    "k2": "0.52261757e-09",
+    "k3": "-0.50728336e-13",
+    "p1": "-0.54958195e-06",
+    "p2": "-0.46089420e-10",
+    "phi": "2.9659070",
+}
 
 
 def write(folder, lens="NULL", **changes):
@@ -53,8 +64,41 @@ def test_focal_length_counts_in_pixels(tmp_path):
     assert right[0] == pytest.approx(here[0], abs=PIXEL)
 
 
-def test_ray_returns_to_its_pixel(tmp_path):
-    camera = read_tsai(write(tmp_path), (200, 300))
+def test_tsai_lens_moves_points_in_focal_lengths(tmp_path):
+    """The formula of the Vision Workbench at (x, y) = (0.1, 0.05) focal lengths."""
+    camera = read_tsai(write(tmp_path, "TSAI", **TSAI), (200, 300))
+    x, y, rr = 0.1, 0.05, 0.0125
+    radial = 1 - 0.1 * rr + 0.05 * rr**2
+    found = camera.project(camera.position + 1e5 * np.array([x, y, 1.0]) @ ROTATION)
+    expected = (
+        100.5 + 600 * (y * radial + 1e-3 * (rr + 2 * y * y) - 2 * 2e-3 * x * y),
+        150.5 + 600 * (x * radial + 2 * 1e-3 * x * y - 2e-3 * (rr + 2 * x * x)),
+    )
+    assert found == pytest.approx(expected, abs=PIXEL)
+
+
+def test_brown_conrady_lens_undistorts_in_the_files_unit(tmp_path):
+    """The Metric camera of Apollo: 76.054 mm, pixels of 5 micrometres."""
+    size = {"fu": "76.054", "fv": "76.054", "cu": "57.25", "cv": "57.25"}
+    lens = {"lens": "BROWN_CONRADY", **size, **BROWN_CONRADY}
+    camera = read_tsai(write(tmp_path, **lens), (22900, 22900))
+    x, y = 30.0 + 0.006, -20.0 + 0.002  # mm, from the lens's own centre
+    rr = x * x + y * y
+    radial = 1 - 0.13361854e-5 * rr + 0.52261757e-9 * rr**2 - 0.50728336e-13 * rr**3
+    decentring = -0.54958195e-6 * rr - 0.46089420e-10 * rr**2
+    ideal = [
+        x * radial - decentring * np.sin(2.965907),
+        y * radial + decentring * np.cos(2.965907),
+        76.054,
+    ]
+    found = camera.project(camera.position + 1e4 * np.array(ideal) @ ROTATION)
+    pixel = 57.25 / 0.005 + 0.5
+    assert found == pytest.approx((pixel - 20.0 / 0.005, pixel + 30.0 / 0.005), abs=1e-4)
+
+
+@pytest.mark.parametrize("lens", [{}, {"lens": "TSAI", **TSAI}])
+def test_ray_returns_to_its_pixel(tmp_path, lens):
+    camera = read_tsai(write(tmp_path, **lens), (200, 300))
     line, sample = np.random.default_rng(2).uniform(0, 200, (2, 20))
     found = camera.project(camera.position + 1e5 * camera.ray(line, sample))
     np.testing.assert_allclose(found, (line, sample), rtol=0, atol=PIXEL)
@@ -91,7 +135,10 @@ def test_camera_of_a_peer_scene_sees_its_dem(real_data):
         ({"fu": "-3", "fv": "-3"}, "focal_length = -600.0 is not positive and finite"),
         ({"fu": "1e300", "fv": "1e300", "pitch": "1e-300"}, "focal_length = inf"),
         ({"u_direction": "0 1 0"}, "u, v and w_direction must be the unit axes"),
-        ({"lens": "TSAI"}, r"lens distortion TSAI is not supported\. Give a pinhole camera"),
+        ({"lens": "RPC"}, r"lens distortion RPC is not supported\. Supported are NULL, TSAI"),
+        ({"lens": "TSAI", "k1": "0"}, "k2 is missing or malformed; the lens TSAI needs k1, k2"),
+        ({"lens": "TSAI", **TSAI, "p1": "1 2"}, "p1 is missing or malformed; the lens TSAI"),
+        ({"lens": "TSAI", **TSAI, "p1": "inf"}, "it needs 5 finite numbers"),
     ],
 )
 def test_unusable_camera_is_an_error(tmp_path, changes, message):
