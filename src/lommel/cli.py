@@ -240,6 +240,34 @@ def orthoproject(
 
 
 @app.command()
+def register(
+    images: Images,
+    dem: Dems,
+    output: Output,
+    cameras: Cameras = None,
+    sun_positions: SunTable = None,
+    positions_unit: Unit = "auto",
+    search_radius: Annotated[
+        float, typer.Option(help="Largest offset on the ground that is looked for, metres.")
+    ] = 3000.0,
+    adjust: Annotated[
+        str, typer.Option(help="pointing, or position: pointing and position.")
+    ] = "pointing",
+    reflectance: Reflectance = "lunar-lambert",
+    overwrite: Overwrite = False,
+):
+    """Find how images sit on the terrain, and write corrected cameras (ISD) for other commands."""
+    from lommel.run.register import run_register
+    from lommel.run.register_to_terrain import RegistrationSettings
+
+    settings = RegistrationSettings(search_radius, adjust, reflectance)
+    files = _files(images, dem, sun_positions, None, positions_unit, cameras)
+    with _progress("Registering") as progress:
+        run_register(files, output, settings, overwrite, progress)
+    _finish(output, draws_report=None)
+
+
+@app.command()
 def simulate(
     scene: Annotated[str, typer.Argument(help="Preset (apollo-orbit, sfs-patch) or SCENE.toml.")],
     output: Output,

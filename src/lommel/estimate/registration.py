@@ -14,7 +14,7 @@ on the map, with the projection P and its derivative J by map coordinates. The c
 found by Gauss-Newton steps with weights renewed at each. Most callers want `adjust_cameras`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csr_array, eye_array
@@ -24,6 +24,7 @@ from scipy.stats import binom
 TERRAIN = -1  # in place of the second image
 STEPS = 12
 LEAST_SCALE = 1.0  # standard errors; residuals are never taken to be better than these say
+MEDIAN_LENGTH = 1.1774  # of two normal errors of size 1
 CAUCHY = 2.385  # of the scale: 95 % efficiency for normal errors
 TURN, MOVE = 1e-6, 1.0  # rad, m; steps of the derivatives by parameters
 NUDGE = 1.0  # m, of those by map coordinates
@@ -61,6 +62,15 @@ class Matches:
     def of(self, chosen):
         """Those that an index or a mask picks."""
         return Matches(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+
+    def renumbered(self, first, second):
+        """The same between images of other numbers."""
+        count = len(self)
+        return replace(self, first=np.full(count, first), second=np.full(count, second))
+
+    def left(self, residual):
+        """What is left of the shifts after an adjustment with these residuals."""
+        return replace(self, shift=-residual)
 
 
 def join_matches(parts):
@@ -154,7 +164,7 @@ def _cauchy(size):
     """Weights of residuals given in standard errors; their scale is that of the middle one."""
     if not size.size:
         return size
-    scale = max(float(np.median(size)) / 1.1774, LEAST_SCALE)  # median length of 2 normal errors
+    scale = max(float(np.median(size)) / MEDIAN_LENGTH, LEAST_SCALE)
     return 1.0 / (1.0 + (size / (CAUCHY * scale)) ** 2)
 
 
@@ -232,6 +242,25 @@ def _solve(matches, residual, slopes, weight, prior, errors):
 def whiten_matches(matches):
     """Matrices (n, 2, 2) that turn residuals into standard errors."""
     return np.linalg.cholesky(np.linalg.inv(matches.covariance)).transpose(0, 2, 1)
+
+
+def mean_error(matches):
+    """Standard error of the mean shift, along one axis, m.
+
+    Parameters
+    ----------
+    matches : Matches
+        What an adjustment has left of them.
+
+    Returns
+    -------
+    error : float, m
+    """
+    size = np.linalg.norm(np.einsum("nij,nj->ni", whiten_matches(matches), matches.shift), axis=1)
+    scale = max(float(np.median(size)) / MEDIAN_LENGTH, LEAST_SCALE)
+    information = _cauchy(size)[:, None, None] * np.linalg.inv(matches.covariance)
+    covariance = scale**2 * np.linalg.inv(information.sum(axis=0))
+    return float(np.sqrt(np.trace(covariance) / 2))
 
 
 def chance_of_agreement(agreeing, tried, tolerance, reach):

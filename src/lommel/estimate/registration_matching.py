@@ -27,6 +27,8 @@ SIGMA_PER_WAVELENGTH = 0.19  # of the Gaussian that halves a wavelength's amplit
 CLIP = 3.0  # rms; one bright crater must not decide
 LEAST_OVERLAP = 0.4  # of the largest overlap, for a shift to be looked at
 LEAST_SAMPLES = 8.0  # independent ones, for an octave to be looked at
+CHANCE_PEAK = 5.0  # ln likelihood that the best of a hundred unrelated shifts reaches
+LEAST_GAIN = 10.0  # ln of the likelihood by which a shift must beat the next one
 LEAST_ERROR = 0.03  # posts; the parabola through the peak is no better
 
 
@@ -55,6 +57,12 @@ class Match:
     runner_up: float
     correlation: float
     is_inside: bool
+
+    @property
+    def is_distinct(self):
+        """True when the shift beats every other by far."""
+        gain = self.likelihood - self.runner_up
+        return self.is_inside and gain > LEAST_GAIN and self.likelihood > 2.0 * self.runner_up
 
 
 def octaves(shape, shortest):
@@ -165,6 +173,7 @@ def _peak(likelihood, samples, shortest):
     if is_inside:
         shift, covariance = _parabola(around)
     place = np.array([row, col]) - size // 2
+    covariance *= max(1.0, runner_up / CHANCE_PEAK)  # what is no noise makes higher peaks elsewhere
     return Match(place + shift, covariance, highest, runner_up, correlation, is_inside)
 
 

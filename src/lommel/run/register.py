@@ -1,0 +1,274 @@
+"""The stage `lommel register`: images, cameras and a DEM in, corrected cameras out.
+
+`run_register` is the command; `register_images` does the work; `visible_offset` is the cheap check
+for other stages.
+"""
+
+import csv
+from dataclasses import asdict, replace
+
+import numpy as np
+
+from lommel.errors import GeometryError, LommelError
+from lommel.io.isd import write_isd
+from lommel.run.inputs import SceneFiles, Skipped, listing
+from lommel.run.products import RunRecord, output_folder
+from lommel.run.raw_images import Terrain, read_raw_images
+from lommel.run.register_to_terrain import (
+    MOST_CHANCE,
+    RegistrationSettings,
+    place_whole,
+    register_to_terrain,
+)
+from lommel.run.tie_images import placed, tie_images
+from lommel.scene.camera import FrameCamera
+
+CHECK_POSTS = 2**16  # of the map on which an image is checked
+VISIBLE = 3.0  # standard errors of the shift, and px, from which an image is visibly off
+COLUMNS = (
+    "image",
+    "used",
+    "quality",
+    "shift_line_px",
+    "shift_sample_px",
+    "shift_m",
+    "error_m",
+    "residual_px",
+    "patches",
+    "patches_agreeing",
+    "correlation",
+    "likelihood",
+    "likelihood_elsewhere",
+    "tie_patches",
+    "tie_residual_px",
+    "camera",
+    "reason",
+)
+
+
+def run_register(
+    files: SceneFiles,
+    output,
+    settings: RegistrationSettings | None = None,
+    overwrite: bool = False,
+    progress=iter,
+):
+    """Register raw images to a DEM and to each other, and write their corrected cameras.
+
+    Parameters
+    ----------
+    files : SceneFiles
+    output : path
+        Folder that appears when the run is done.
+    settings : RegistrationSettings, optional
+    overwrite : bool
+    progress : callable
+        Wraps the iterable of images.
+
+    Returns
+    -------
+    results : dict of str to number
+        As in ``run.json``.
+    """
+    settings = settings or RegistrationSettings()
+    record = RunRecord("register", asdict(settings))
+    with output_folder(output, overwrite) as folder:
+        with record.stage("read"):
+            images, skipped = read_raw_images(files)
+            tables = [files.sun_positions] if files.sun_positions else []
+            record.add_inputs([*files.images, *files.dems, *files.cameras, *tables])
+        with record.stage("register"):
+            states, failed = register_images(images, Terrain(files.dems), settings, progress)
+            known = placed(states)
+            lost = [state for number, state in enumerate(states) if number not in known]
+            skipped += failed + [Skipped(s.image.name, why_lost(s, settings)) for s in lost]
+        if not known:
+            raise GeometryError("No image could be registered.\n" + listing(skipped))
+        with record.stage("write"):
+            used = [states[number] for number in sorted(known)]
+            for state in used:
+                write_isd(folder / _camera_name(state), with_sun(state.corrected))
+            _write_table(folder / "register.csv", used, lost, skipped)
+        record.add_skipped(skipped)
+        record.results = _results(used)
+        record.outcome = {"name": "done", "sentence": _sentence(used)}
+        record.write(folder)
+    return record.results
+
+
+def register_images(images, terrain, settings, progress=iter):
+    """Register images to the terrain and among each other.
+
+    Parameters
+    ----------
+    images : list of RawImage
+    terrain : Terrain
+    settings : RegistrationSettings
+    progress : callable
+        Wraps the iterable of images.
+
+    Returns
+    -------
+    states : list of Registration
+        `lommel.run.tie_images.placed` tells which of them have a place.
+    failed : list of Skipped
+        Images that could not be looked at.
+    """
+    states, failed = [], []
+    for image in progress(images):
+        try:
+            states.append(register_to_terrain(image, terrain, settings))
+        except LommelError as error:
+            failed.append(Skipped(image.name, str(error)))
+    tie_images(states, settings)
+    return states, failed
+
+
+def visible_offset(image, terrain, settings=None):
+    """How far an image is visibly off the terrain; a second's check of the image as a whole.
+
+    Parameters
+    ----------
+    image : RawImage
+    terrain : Terrain
+    settings : RegistrationSettings, optional
+
+    Returns
+    -------
+    offset : float, m
+        0 when the image lies where its camera says, or when the terrain does not tell.
+    """
+    settings = settings or RegistrationSettings()
+    state, _, spacing = place_whole(image, terrain, settings, CHECK_POSTS)
+    whole = state.whole
+    if whole is None or not whole.is_distinct:
+        return 0.0
+    length = float(np.linalg.norm(whole.shift))
+    error = float(np.sqrt(np.trace(whole.covariance)))
+    least = max(VISIBLE * error, VISIBLE * state.site.gsd / spacing)
+    return length * spacing if length > least else 0.0
+
+
+def with_sun(image):
+    """An image's camera, knowing the Sun that a table gave."""
+    camera = image.camera
+    if camera.sun_position is None and isinstance(camera, FrameCamera):
+        return replace(camera, sun_position=image.sun_position)
+    return camera
+
+
+def quality(state):
+    """How well an image's place is known, in a word.
+
+    Parameters
+    ----------
+    state : Registration
+
+    Returns
+    -------
+    quality : str
+        ``patches``: parts of the image agree on it; ``whole``: the image as a whole has one
+        distinct place; ``ties``: only other images tell.
+    """
+    if not state.is_on_terrain:
+        return "ties"
+    return "patches" if state.chance < MOST_CHANCE else "whole"
+
+
+def why_lost(state, settings):
+    """Why an image's place was not found, and what to do."""
+    if state.whole is None:
+        return (
+            f"{state.image.name}: image and DEM share too little, or the DEM's posts are too far "
+            "apart for it. Give a DEM that covers the image, with finer posts."
+        )
+    whole = state.whole
+    found = f"{whole.likelihood:.0f} against {max(whole.runner_up, 0.0):.0f}"
+    if not whole.is_inside:
+        found += ", at the rim of the search"
+    return (
+        f"{state.image.name}: no place on the terrain stands out (log-likelihood of the best, "
+        f"{found} elsewhere). It may lie farther off than --search-radius "
+        f"{settings.search_radius:g} m, be lit from too high, or the DEM may be too coarse."
+    )
+
+
+def _camera_name(state):
+    return f"{state.image.path.stem}.json"
+
+
+def _write_table(path, used, lost, skipped):
+    reasons = {skip.name: skip.reason for skip in skipped}
+    with open(path, "w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n", restval="")
+        writer.writeheader()
+        for state in used:
+            writer.writerow(_row(state) | {"used": 1, "camera": _camera_name(state)})
+        for state in lost:
+            reason = reasons.pop(state.image.name)
+            writer.writerow(_match_row(state) | {"used": 0, "reason": reason})
+        for name, reason in reasons.items():
+            writer.writerow({"image": name, "used": 0, "reason": reason})
+
+
+def _row(state):
+    line, sample = state.shift
+    gsd = state.site.gsd
+    return _match_row(state) | {
+        "quality": quality(state),
+        "shift_line_px": _number(line),
+        "shift_sample_px": _number(sample),
+        "shift_m": _number(np.hypot(line, sample) * gsd),
+        "error_m": _number(state.error),
+        "residual_px": _number(state.residual / gsd),
+        "patches": state.patches,
+        "patches_agreeing": state.agreeing,
+        "tie_patches": state.ties,
+        "tie_residual_px": _number(state.tie_residual / gsd),
+    }
+
+
+def _match_row(state):
+    row = {"image": state.image.name}
+    if state.whole is not None:
+        row |= {
+            "correlation": _number(state.whole.correlation),
+            "likelihood": _number(state.whole.likelihood),
+            "likelihood_elsewhere": _number(state.whole.runner_up),
+        }
+    return row
+
+
+def _number(value):
+    return f"{float(value):.5g}" if np.isfinite(value) else ""
+
+
+def _results(used):
+    shifts = [float(np.linalg.norm(state.shift)) for state in used]
+    values = {
+        "images": len(used),
+        "shift_px": float(np.median(shifts)),
+        "shift_m": float(np.median([s * u.site.gsd for s, u in zip(shifts, used, strict=True)])),
+        "error_m": _median([state.error for state in used]),
+        "residual_px": _median([state.residual / state.site.gsd for state in used]),
+        "patches": sum(state.patches for state in used),
+        "tie_residual_px": _median([state.tie_residual / state.site.gsd for state in used]),
+    }
+    return {name: value for name, value in values.items() if np.isfinite(value)}
+
+
+def _median(values):
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.median(known)) if known else np.nan
+
+
+def _sentence(used):
+    count = len(used)
+    sentence = f"Registered {count} image{'s' if count > 1 else ''}."
+    rough = [s.image.name for s in used if quality(s) == "whole" and s.error > s.site.gsd]
+    if rough:
+        sentence += (
+            f" The terrain places {', '.join(rough[:5])} only as a whole, to error_m of "
+            "register.csv: a finer DEM would tell more."
+        )
+    return sentence + " Name the new cameras with --cameras, or put them beside the images."
