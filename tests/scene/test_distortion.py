@@ -147,6 +147,15 @@ def test_folding_of_a_distorting_model_is_found_too():
     assert np.isnan(distortion.undistort(0.7, 0.0)).all()
 
 
+def test_pole_of_a_negative_nac_coefficient_ends_its_reach():
+    """1 / (1 + k y^2) has its pole at y = 1 / sqrt(-k), here 10 mm."""
+    distortion = Distortion("lrolrocnac", (-0.01,))
+    assert np.isfinite(distortion.undistort(0.0, 9.8)).all()
+    assert np.isnan(distortion.undistort(0.0, np.array([10.0, 10.2]))).all()
+    x, y = distortion.distort(0.0, np.array([5.0, 40.0]))
+    np.testing.assert_allclose(distortion.undistort(x, y)[1], [5.0, 40.0], rtol=0, atol=CLOSE)
+
+
 def test_unit_carries_a_model_to_a_plane_in_pixels():
     in_mm = Distortion("brown-conrady", APOLLO_METRIC).distort(20.0, -30.0)
     in_pixels = Distortion("brown-conrady", APOLLO_METRIC, unit=200.0).distort(4000.0, -6000.0)

@@ -3,15 +3,18 @@
 Most callers want `lommel.scene.camera.FrameCamera`.
 """
 
+from typing import Any
+
 import numpy as np
 from numba import njit, prange
 
-from lommel.scene.distortion_kernels import distort, undistort
+from lommel.scene.distortion_kernels import SERIAL, distort, undistort
 
 BLOCK = 4096  # points per parallel work item
+PARALLEL: dict[str, Any] = {"cache": True, "parallel": True, "error_model": "numpy"}
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def _project(xyz, position, rotation, plane, lens, line, sample):
     px, py, pz = position[0], position[1], position[2]
     axes, focal = rotation, plane.focal_length
@@ -25,7 +28,7 @@ def _project(xyz, position, rotation, plane, lens, line, sample):
         line[i], sample[i] = to_image(plane, x, y)
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def _look(line, sample, rotation, plane, lens, out):
     axes, focal = rotation, plane.focal_length
     for i in range(line.size):
@@ -37,7 +40,7 @@ def _look(line, sample, rotation, plane, lens, out):
             out[i, k] = x * axes[0, k] + y * axes[1, k] + z * axes[2, k]
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def to_image(plane, x, y):
     """Line and sample of a place on the focal plane."""
     a = plane.to_pixels
@@ -46,7 +49,7 @@ def to_image(plane, x, y):
     return line, sample
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def to_plane(plane, line, sample):
     """Place on the focal plane of a line and sample; the inverse of `to_image`."""
     line, sample = line - plane.principal_line, sample - plane.principal_sample
@@ -54,7 +57,7 @@ def to_plane(plane, line, sample):
     return a[0, 0] * line + a[0, 1] * sample, a[1, 0] * line + a[1, 1] * sample
 
 
-@njit(cache=True, parallel=True)
+@njit(**PARALLEL)
 def project_frame(xyz, position, rotation, plane, lens, line, sample):
     """Image coordinates of ground points.
 
@@ -77,7 +80,7 @@ def project_frame(xyz, position, rotation, plane, lens, line, sample):
         )
 
 
-@njit(cache=True, parallel=True)
+@njit(**PARALLEL)
 def look_frame(line, sample, rotation, plane, lens, out):
     """Directions in which pixels look; the inverse of `project_frame`.
 

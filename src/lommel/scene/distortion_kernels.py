@@ -7,6 +7,8 @@ Every closed form takes focal-plane coordinates in the model's own unit and retu
 Most callers want `lommel.scene.distortion.Distortion`, which says what the models mean.
 """
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
@@ -14,10 +16,12 @@ NONE, RADIAL, BROWN_CONRADY, RADTAN, TRANSVERSE, KAGUYA, LRO_NAC = range(7)
 
 STEPS = 30  # Newton needs 3 to 6; more only where nothing can be found
 CONVERGED = 1e-7  # relative length of a Newton step; the error after it is its square
+# 1 / 0 is infinite, as for arrays; damaged coefficients must not end the program
+SERIAL: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
 FAST = {"contract", "nsz"}
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(**SERIAL, fastmath=FAST)
 def _radial(c, x, y):
     rr = x * x + y * y
     factor = 1.0 - c[0] - rr * (c[1] + rr * c[2])
@@ -32,7 +36,7 @@ def _radial(c, x, y):
     )
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(**SERIAL, fastmath=FAST)
 def _brown_conrady(c, x, y):
     x, y = x - c[0], y - c[1]
     rr = x * x + y * y
@@ -51,7 +55,7 @@ def _brown_conrady(c, x, y):
     )
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(**SERIAL, fastmath=FAST)
 def _radtan(c, x, y):
     rr = x * x + y * y
     factor = 1.0 + rr * (c[0] + rr * (c[1] + rr * c[4]))
@@ -68,7 +72,7 @@ def _radtan(c, x, y):
     )
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(**SERIAL, fastmath=FAST)
 def _cubic(c, first, x, y):
     """Polynomial in 1, x, y, x^2, xy, y^2, x^3, x^2 y, x y^2, y^3 and its two derivatives."""
     c0, cx, cy, cxx, cxy, cyy = (
@@ -87,14 +91,14 @@ def _cubic(c, first, x, y):
     return value, along_x, along_y
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(**SERIAL, fastmath=FAST)
 def _transverse(c, x, y):
     u, ux, uy = _cubic(c, 0, x, y)
     v, vx, vy = _cubic(c, 10, x, y)
     return u, v, ux, uy, vx, vy
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(**SERIAL, fastmath=FAST)
 def _kaguya(c, x, y):
     r = np.sqrt(x * x + y * y) + 1e-300  # not zero, for the direction below
     to_x, to_y = x / r, y / r
@@ -110,13 +114,14 @@ def _kaguya(c, x, y):
     )
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(**SERIAL, fastmath=FAST)
 def _lro_nac(c, x, y):
     share = 1.0 / (1.0 + c[0] * y * y)
-    return x, y * share, 1.0, 0.0, 0.0, (2.0 * share - 1.0) * share
+    # the share is negative behind the pole of a negative k; so is the derivative then
+    return x, y * share, 1.0, 0.0, 0.0, (2.0 * share - 1.0) * abs(share)
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def closed_form(kind, c, x, y):
     """Closed form of a model by its number; both argument and result in the model's unit."""
     if kind == RADIAL:
@@ -134,7 +139,7 @@ def closed_form(kind, c, x, y):
     return x, y, 1.0, 0.0, 0.0, 1.0
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def reach(kind, c, radii, azimuths):
     """Distance from the axis within which the closed form keeps its orientation.
 
@@ -163,7 +168,7 @@ def reach(kind, c, radii, azimuths):
     return np.inf
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def _direct(kind, c, limit, x, y):
     if not x * x + y * y <= limit * limit:
         return np.nan, np.nan
@@ -171,7 +176,7 @@ def _direct(kind, c, limit, x, y):
     return u, v
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def _inverse(kind, c, limit, u, v):
     """Newton from the target itself, kept within the reach of the model."""
     if not (np.isfinite(u) and np.isfinite(v)):
@@ -196,7 +201,7 @@ def _inverse(kind, c, limit, u, v):
     return np.nan, np.nan
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def distort(lens, x, y):
     """Distorted focal-plane coordinates of undistorted ones; NaN beyond the model's reach.
 
@@ -215,7 +220,7 @@ def distort(lens, x, y):
     return u * lens.unit, v * lens.unit
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def undistort(lens, x, y):
     """Undistorted focal-plane coordinates of distorted ones; the inverse of `distort`."""
     if lens.kind == NONE:
@@ -228,14 +233,14 @@ def undistort(lens, x, y):
     return u * lens.unit, v * lens.unit
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def distort_all(lens, x, y, u, v):
     """`distort` for flat arrays."""
     for i in range(x.size):
         u[i], v[i] = distort(lens, x[i], y[i])
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def undistort_all(lens, x, y, u, v):
     """`undistort` for flat arrays."""
     for i in range(x.size):

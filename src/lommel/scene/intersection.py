@@ -4,7 +4,7 @@ Rays come from a camera, ``camera.origin(line, sample)`` and ``camera.ray(line, 
 and an ellipsoid are met in closed form. On a terrain a ray is followed from the height of its
 highest post to that of its lowest, cell by cell. Between four posts the terrain is bilinear, hence
 a parabola under a straight line, so a ray that only grazes a ridge meets it, and not the plain
-behind it; the place is found by bisection to a tenth of a millimetre. Most callers want
+behind it; the place is found to a tenth of a millimetre along the ray. Most callers want
 `meet_sphere` and `meet_terrain`.
 """
 
@@ -87,23 +87,24 @@ def meet_terrain(origin, direction, grid, heights):
     origin, direction, shape = _flat(origin, direction)
     xyz = np.full(origin.shape, np.nan)
     if np.isfinite(heights).any():
+        low = grid.body.radius + np.nanmin(heights) - CLEAR
+        high = grid.body.radius + np.nanmax(heights) + CLEAR
         for first in range(0, len(origin), CHUNK):
             part = slice(first, first + CHUNK)
-            xyz[part] = _meet_terrain(origin[part], direction[part], grid, heights)
+            xyz[part] = _meet_terrain(origin[part], direction[part], grid, heights, low, high)
     return xyz.reshape(shape)
 
 
-def _meet_terrain(origin, direction, grid, heights):
-    radius = grid.body.radius
-    start, end = _span(
-        origin, direction, radius + np.nanmin(heights) - CLEAR, radius + np.nanmax(heights) + CLEAR
-    )
+def _meet_terrain(origin, direction, grid, heights, low, high):
+    start, end = _span(origin, direction, low, high)
     count = int(np.clip(np.fmax.reduce(end - start, initial=0.0) / KNOT_SPACING + 2, *KNOTS))
     along = start[:, None] + np.linspace(0.0, 1.0, count) * (end - start)[:, None]
     knots = _index_at(grid, origin[:, None] + along[..., None] * direction[:, None])
     distance, place = np.empty(len(origin)), np.full((len(origin), 2), np.nan)
     with threads_for((distance.size, 1)):
-        kernels.meet_heights(origin, direction, start, end, knots, heights, radius, distance, place)
+        kernels.meet_heights(
+            origin, direction, start, end, knots, heights, grid.body.radius, distance, place
+        )
     xyz = origin + distance[:, None] * direction
     bend = np.linalg.norm(_index_at(grid, xyz) - place, axis=1)
     xyz[~(bend <= MISPLACED)] = np.nan

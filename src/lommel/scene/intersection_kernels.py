@@ -8,11 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
-FAST = {"contract", "nsz"}
+from lommel.scene.camera_kernels import PARALLEL
+from lommel.scene.distortion_kernels import FAST, SERIAL
+
 BLOCK = 1024  # rays per parallel work item
 INSIDE = 1e-6  # posts; clearances of a cell are taken this far from its border
 LEAST_STEP = 1e-6  # knots, for rays that come down almost upright
-CLOSE = 1e-4  # m along the ray, where bisection ends
+CLOSE = 1e-4  # m along the ray, to which the place is found
 UNKNOWN, ABOVE, UNDERGROUND, MET = range(4)
 
 
@@ -26,7 +28,7 @@ class Ray(NamedTuple):
     radius: float  # m, from which heights count
 
 
-@njit(cache=True, parallel=True)
+@njit(**PARALLEL)
 def cross_ellipsoid(origin, direction, radii, enter, leave):
     """Distances at which lines enter and leave an ellipsoid; NaN where they pass by.
 
@@ -54,7 +56,7 @@ def cross_ellipsoid(origin, direction, radii, enter, leave):
             enter[i], leave[i] = middle - half, middle + half
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(**SERIAL, fastmath=FAST)
 def _cubic(knots, at):
     """Row and column on a ray, between knots of equal distance, by cubic interpolation."""
     i = min(max(np.int64(at) - 1, 0), knots.shape[0] - 4)
@@ -68,7 +70,7 @@ def _cubic(knots, at):
     return row, col
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(**SERIAL, fastmath=FAST)
 def _bilinear(heights, row, col):
     """Height of the terrain; NaN outside and beside missing posts."""
     rows, cols = heights.shape
@@ -81,7 +83,7 @@ def _bilinear(heights, row, col):
     return upper + v * (lower - upper)
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def _clearance(ray, at, knots, heights):
     """Height of a ray above the terrain, at a knot or between; NaN where terrain is unknown."""
     row, col = _cubic(knots, at)
@@ -92,7 +94,7 @@ def _clearance(ray, at, knots, heights):
     return np.sqrt(x * x + y * y + z * z) - ray.radius - _bilinear(heights, row, col)
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def _to_border(index, rate):
     """How far to the next whole row or column, in knots, at a rate of rows or columns per knot."""
     if rate > 0.0:
@@ -102,10 +104,20 @@ def _to_border(index, rate):
     return np.inf
 
 
-@njit(cache=True, nogil=True)
-def _dip(above, below, ray, knots, heights):
-    """Place between one above the terrain and one below it where the ray goes under."""
-    while (below - above) * ray.pace > CLOSE:
+@njit(**SERIAL)
+def _dip(above, below, guess, ray, knots, heights):
+    """Place between one above the terrain and one below it where the ray goes under.
+
+    A good guess is only checked on both sides; from a bad one the interval is halved.
+    """
+    reach = 0.5 * CLOSE / ray.pace
+    for place in (guess - reach, guess + reach):
+        if above < place < below:
+            if _clearance(ray, place, knots, heights) > 0.0:
+                above = place
+            else:
+                below = place
+    while (below - above) * ray.pace > 1.1 * CLOSE:
         middle = 0.5 * (above + below)
         if middle in (above, below):
             break
@@ -116,7 +128,7 @@ def _dip(above, below, ray, knots, heights):
     return 0.5 * (above + below)
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def _meet_in_cell(first, last, was_above, ray, knots, heights):
     """Place in a cell where a ray meets the terrain, and how it fares behind the cell.
 
@@ -129,17 +141,17 @@ def _meet_in_cell(first, last, was_above, ray, knots, heights):
         return np.nan, UNKNOWN
     if near <= 0.0:
         return (first, MET) if was_above else (np.nan, UNDERGROUND)
-    if far <= 0.0:
-        return _dip(first, last, ray, knots, heights), MET
     bend, slope = 2.0 * (near - 2.0 * middle + far), 4.0 * middle - 3.0 * near - far
-    if bend > 0.0 and 0.0 < -slope < 2.0 * bend:
-        lowest = first - 0.5 * slope / bend * (last - first)
-        if _clearance(ray, lowest, knots, heights) <= 0.0:
-            return _dip(first, lowest, ray, knots, heights), MET
+    if far > 0.0 and not (bend > 0.0 and 0.0 < -slope < 2.0 * bend):
+        return np.nan, ABOVE
+    below = last if far <= 0.0 else first - 0.5 * slope / bend * (last - first)
+    if far <= 0.0 or _clearance(ray, below, knots, heights) <= 0.0:
+        root = 2.0 * near / (np.sqrt(max(slope * slope - 4.0 * bend * near, 0.0)) - slope)
+        return _dip(first, below, first + root * (last - first), ray, knots, heights), MET
     return np.nan, ABOVE
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def _meet(ray, knots, heights):
     """Place on a ray, in knots, where it first dips into the terrain, cell by cell."""
     spans = knots.shape[0] - 1
@@ -163,7 +175,7 @@ def _meet(ray, knots, heights):
     return np.nan
 
 
-@njit(cache=True, parallel=True)
+@njit(**PARALLEL)
 def meet_heights(origin, direction, start, end, knots, heights, radius, out, place):
     """Distance to the first point of a terrain in front of each ray's origin.
 

@@ -9,16 +9,15 @@ exposed, is the offset; it vanishes at the solution. Most callers want
 import numpy as np
 from numba import njit, prange
 
-from lommel.scene.camera_kernels import BLOCK, to_image, to_plane
-from lommel.scene.distortion_kernels import distort, undistort
+from lommel.scene.camera_kernels import BLOCK, PARALLEL, to_image, to_plane
+from lommel.scene.distortion_kernels import FAST, SERIAL, distort, undistort
 
 COARSE = 0.5  # px; where the search without the lens ends
 FINE = 1e-5  # px; last step of the search with it, the error after it is far smaller
-FAST = {"contract", "nsz"}
 STEPS = 40  # 3 to 8 are needed; more only where no line sees the point
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(**SERIAL, fastmath=FAST)
 def _pose(scan, line, centre, axes):
     """Position and rotation of a line, linear between the edges of lines."""
     at = line - scan.first
@@ -33,7 +32,7 @@ def _pose(scan, line, centre, axes):
             axes[j, k] = here[m] + t * (there[m] - here[m])
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def _in_camera(point, centre, axes):
     dx, dy, dz = point[0] - centre[0], point[1] - centre[1], point[2] - centre[2]
     return (
@@ -43,7 +42,7 @@ def _in_camera(point, centre, axes):
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def _side(point, plane, centre, axes):
     """Signed distance of a point from the exposed plane, lens left out, in line widths times z.
 
@@ -54,7 +53,7 @@ def _side(point, plane, centre, axes):
     return plane.principal_line * z + plane.focal_length * (a[0, 0] * x + a[0, 1] * y)
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def _offset(point, line, scan, plane, lens, centre, axes):
     """Offset from the exposed line, and the sample; NaN for a point behind the camera."""
     _pose(scan, line, centre, axes)
@@ -65,7 +64,7 @@ def _offset(point, line, scan, plane, lens, centre, axes):
     return to_image(plane, x, y)
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def _coarse_line(point, scan, plane, low_side, high_side, centre, axes):
     """Line that sees a point, lens left out, to `COARSE`; regula falsi after Illinois."""
     low, high = scan.first, scan.last
@@ -87,7 +86,7 @@ def _coarse_line(point, scan, plane, low_side, high_side, centre, axes):
     return line
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def _fine_line(point, line, scan, plane, lens, centre, axes):
     """Line and sample that see a point, by the secant method; NaN when there is none."""
     last, last_offset = line + 1.0, _offset(point, line + 1.0, scan, plane, lens, centre, axes)[0]
@@ -105,7 +104,7 @@ def _fine_line(point, line, scan, plane, lens, centre, axes):
     return np.nan, np.nan
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def _project(xyz, scan, plane, lens, line, sample):
     centre, axes = np.empty(3), np.empty((3, 3))
     first_centre, first_axes = np.empty(3), np.empty((3, 3))
@@ -123,7 +122,7 @@ def _project(xyz, scan, plane, lens, line, sample):
             line[i], sample[i] = np.nan, np.nan
 
 
-@njit(cache=True, nogil=True)
+@njit(**SERIAL)
 def _look(line, sample, scan, plane, lens, out):
     centre, axes = np.empty(3), np.empty((3, 3))
     for i in range(line.size):
@@ -139,7 +138,7 @@ def _look(line, sample, scan, plane, lens, out):
             out[i, k] = x * axes[0, k] + y * axes[1, k] + z * axes[2, k]
 
 
-@njit(cache=True, parallel=True)
+@njit(**PARALLEL)
 def project_line_scan(xyz, scan, plane, lens, line, sample):
     """Image coordinates of ground points.
 
@@ -158,7 +157,7 @@ def project_line_scan(xyz, scan, plane, lens, line, sample):
         _project(xyz[first:last], scan, plane, lens, line[first:last], sample[first:last])
 
 
-@njit(cache=True, parallel=True)
+@njit(**PARALLEL)
 def look_line_scan(line, sample, scan, plane, lens, out):
     """Directions in which pixels look; the inverse of `project_line_scan`.
 
