@@ -71,14 +71,14 @@ def describe_pixel(path, sample, line, dem=None, camera=None, sun_positions=None
         "file": str(path),
         "sample": sample,
         "line": line,
-        "longitude_deg": _degrees(longitude),
-        "latitude_deg": _degrees(latitude),
+        "longitude_deg": round_degrees(longitude),
+        "latitude_deg": round_degrees(latitude),
         "height_m": round(float(height), DECIMALS_M),
     }
     to_camera, to_sun = unit(origin - ground), None if sun is None else unit(sun - ground)
     facts |= _angles("", horizontal if dem is None else normal, to_camera, to_sun)
     if to_sun is not None:
-        facts["phase_deg"] = _between(to_sun, to_camera)
+        facts["phase_deg"] = round_degrees(angle_between(to_sun, to_camera))
     if dem is not None:
         facts |= _angles("ellipsoid_", horizontal, to_camera, to_sun)
     return facts
@@ -157,14 +157,20 @@ def _crossed_part(grid, origin, direction, body):
 
 
 def _angles(prefix, normal, to_camera, to_sun):
-    facts = {} if to_sun is None else {f"{prefix}incidence_deg": _between(normal, to_sun)}
-    return facts | {f"{prefix}emission_deg": _between(normal, to_camera)}
+    facts = (
+        {}
+        if to_sun is None
+        else {f"{prefix}incidence_deg": round_degrees(angle_between(normal, to_sun))}
+    )
+    return facts | {f"{prefix}emission_deg": round_degrees(angle_between(normal, to_camera))}
 
 
-def _between(first, second):
-    """Angle of two unit vectors in degrees, precise also where they are parallel."""
-    return _degrees(2 * np.arctan2(np.linalg.norm(first - second), np.linalg.norm(first + second)))
+def angle_between(first, second):
+    """Angles of unit vectors (..., 3) in rad, precise also where they are parallel."""
+    apart, together = (np.linalg.norm(first + sign * second, axis=-1) for sign in (-1, 1))
+    return 2 * np.arctan2(apart, together)
 
 
-def _degrees(angle):
-    return round(float(np.degrees(angle)), DECIMALS_DEG)
+def round_degrees(angle, decimals=DECIMALS_DEG):
+    """An angle in degrees, rounded; from rad."""
+    return round(float(np.degrees(angle)), decimals)

@@ -5,8 +5,10 @@ Most callers want `describe`.
 
 import numpy as np
 
+from lommel.io.cameras import find_camera, read_camera
 from lommel.io.positions import find_position, read_positions
 from lommel.io.raster import raster_info
+from lommel.run.camera_facts import camera_facts
 from lommel.scene.body import MOON, local_frame, to_lonlat, to_xyz
 from lommel.scene.geometry import unit, viewing_geometry
 
@@ -20,10 +22,14 @@ def describe(path, sun_positions=None, spacecraft_positions=None, camera=None, b
     Parameters
     ----------
     path : path
-        Any raster GDAL reads; one without a CRS has no place, so only its pixels are described.
+        Any raster GDAL reads. One without a CRS has its place from its camera; without that, only
+        its pixels are described.
     sun_positions, spacecraft_positions : path, optional
         Position tables. With the Sun come the subsolar point and the light at the image's centre,
-        with the spacecraft the subspacecraft point and the view, with both the phase.
+        with the spacecraft the subspacecraft point and the view, with both the phase. A camera
+        knows its own place, and mostly the Sun's.
+    camera : path, optional
+        File with the image's camera; beside the image or in it when there is none.
     body : Body
 
     Returns
@@ -32,6 +38,7 @@ def describe(path, sun_positions=None, spacecraft_positions=None, camera=None, b
         Angles at the centre are those on the sphere; azimuth is clockwise from north.
     """
     info = raster_info(path, body)
+    camera = camera or (None if info.grid else find_camera(path))
     facts = {
         "file": str(path),
         "rows": info.shape[0],
@@ -42,6 +49,13 @@ def describe(path, sun_positions=None, spacecraft_positions=None, camera=None, b
         "mask": "second band" if info.has_mask_band else None,
         "crs": info.grid.crs.name if info.grid else None,
     }
+    if camera is not None:
+        model = read_camera(camera, info.shape)
+        sun = None
+        if model.sun_position is None and sun_positions is not None:
+            table = read_positions(sun_positions, "sun", body)
+            sun = find_position(table, info.path.name, sun_positions)
+        return facts | {"camera_file": str(camera)} | camera_facts(str(path), model, sun, body)
     if info.grid:
         facts |= _place(info.grid)
     sun, spacecraft = (
