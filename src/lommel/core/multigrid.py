@@ -14,6 +14,7 @@ Most callers want `NormalEquations` and `conjugate_gradients`.
 
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numba
 import numpy as np
@@ -89,31 +90,57 @@ class NormalEquations:
     """
 
     def __init__(self, tensors, curvature, masses, posts=None):
-        rows, cols = tensors[0].shape[0] + 1, tensors[0].shape[1] + 1
+        shape = tensors[0].shape[0] + 1, tensors[0].shape[1] + 1
         self.masses = np.asarray(masses, float)
-        posts = np.zeros((1, cols), np.float32) if posts is None else posts
+        posts = np.zeros((1, shape[1]), np.float32) if posts is None else posts
         mass = posts + np.float32(self.masses[0])
-        self.levels = [_level((rows, cols), tensors, curvature, 0.0, mass, DEGREE)]
-        while min(self.levels[-1].shape) > SMALLEST:
-            finer = self.levels[-1]
-            shape = coarse_shape(finer.shape)
+        curvature = np.asarray(curvature, np.float32)
+        self.levels = [_level(shape, tuple(tensors), curvature, 0.0, mass, DEGREE)]
+        while min(shape) > SMALLEST:
+            finer_shape, shape = shape, coarse_shape(shape)
             coarse = tuple(np.empty((shape[0] - 1, shape[1] - 1), np.float32) for _ in range(3))
-            with threads_for(finer.shape):
-                for fine, half in zip(finer.tensors, coarse, strict=True):
-                    coarsen_cells(fine, half)
-            weights = finer.curvature / np.float32(4)
+            curvature = curvature / np.float32(4)
             if posts.shape[0] > 1:
                 posts, finer_posts = np.empty(shape, np.float32), posts
-                with threads_for(finer.shape):
+                with threads_for(finer_shape):
                     restrict(finer_posts, posts)
             else:
                 posts = np.zeros((1, shape[1]), np.float32)
             own, *longer = coarse_masses(self.masses, len(self.levels))
             mass = posts + np.float32(own)
-            degree = min(2 * finer.degree, LARGEST_DEGREE)
+            degree = min(2 * self.levels[-1].degree, LARGEST_DEGREE)
             felt = longer if len(self.levels) >= LONG_WAVES_FROM else ()
-            self.levels.append(_level(shape, coarse, weights, HOURGLASS, mass, degree, felt))
+            self.levels.append(_level(shape, coarse, curvature, HOURGLASS, mass, degree, felt))
+        self._vectors: list[np.ndarray] = []
+        self.renew(tensors)
+
+    def renew(self, tensors):
+        """Take other tensors of the same shape; all else stays, also the memory in use."""
+        self.levels[0].tensors = tuple(tensors)
+        for finer, coarse in pairwise(self.levels):
+            with threads_for(finer.shape):
+                for fine, half in zip(finer.tensors, coarse.tensors, strict=True):
+                    coarsen_cells(fine, half)
+        for level in self.levels:
+            # each element m w w^T has weights w that sum to 1: a diagonal of m w keeps its
+            # eigenvalues below 1; a post holds the share 1 / 4^l of an average over 2^l x 2^l
+            lumped = (level.long_masses / 4.0 ** np.arange(level.long_masses.size)).sum()
+            with threads_for(level.shape):
+                inverse_diagonal(
+                    *level.tensors,
+                    level.curvature,
+                    level.hourglass,
+                    level.mass + np.float32(lumped),
+                    level.inverse_diagonal,
+                )
         self._inverse = _dense_inverse(self.levels[-1])
+
+    @property
+    def vectors(self):
+        """Four arrays (rows, cols) for the use of a solver."""
+        if not self._vectors:
+            self._vectors = [np.empty(self.shape, np.float32) for _ in range(4)]
+        return self._vectors
 
     @property
     def shape(self):
@@ -167,6 +194,7 @@ class LinearSolution:
     Attributes
     ----------
     x : float32 array (rows, cols)
+        Memory of the equations: it is overwritten by the next solve.
     iterations : int
         V-cycles, one per iteration.
     reduction : float
@@ -193,11 +221,11 @@ def conjugate_gradients(equations, right_hand_side, tolerance, max_iterations):
     -------
     solution : LinearSolution
     """
-    residual = right_hand_side.copy()
-    x = np.zeros_like(residual)
+    residual, x, direction, image = equations.vectors
+    np.copyto(residual, right_hand_side)
+    x[:] = 0.0
     preconditioned = equations.precondition(residual)
-    direction = preconditioned.copy()
-    image = np.empty_like(residual)
+    np.copyto(direction, preconditioned)
     energy = start = dot(residual, preconditioned)
     if not start > 0:
         return LinearSolution(x, 0, 0.0)
@@ -320,15 +348,10 @@ def _row_dot(a, b):
 
 
 def _level(shape, tensors, curvature, hourglass, mass, degree, longer=()):
-    """Coefficients and work arrays of a grid."""
+    """Coefficients of a grid, and its work arrays."""
     long_masses = np.array([0.0, *longer])
     inverse, *work = (np.zeros(shape, np.float32) for _ in range(5))
-    curvature, hourglass = curvature.astype(np.float32), np.float32(hourglass)
-    # each element m w w^T has weights w that sum to 1: a diagonal of m w keeps its eigenvalues
-    # below 1; a post far from the border holds the share 1 / 4^l of an average over 2^l x 2^l
-    lumped = np.float32((long_masses / 4.0 ** np.arange(long_masses.size)).sum())
-    with threads_for(shape):
-        inverse_diagonal(*tensors, curvature, hourglass, mass + lumped, inverse)
+    hourglass = np.float32(hourglass)
     return Level(tensors, curvature, hourglass, mass, degree, inverse, long_masses, *work)
 
 

@@ -205,7 +205,9 @@ def _bend_spectra(relief, gains, spacing, respond, shape):
     Relief with the DEM error's spectrum and random phases is added to the DEM and rendered: the
     part of the response that does not follow the slope is no noise, the solver models it.
     """
-    field = _random_relief(relief, (shape[0] + 1, shape[1] + 1))
+    field = np.zeros((shape[0] + 1, shape[1] + 1), np.float32)
+    tile = _central_tile(field)
+    tile[:] = _random_relief(relief, tile.shape)
     return np.stack(
         [separate(respond(field, k), gain, spacing).noise for k, gain in enumerate(gains)]
     )
@@ -251,7 +253,7 @@ def separate(image, gain, spacing):
 
 def _periodogram(image):
     """Windowed power of the central tile and its wave numbers, rad per post."""
-    tile = _central_tile(image)
+    tile = _central_tile(image).astype(float)
     known = np.isfinite(tile)
     window = np.hanning(tile.shape[0])[:, None] * np.hanning(tile.shape[1])[None, :] * known
     tile = np.where(known, tile, 0.0)
@@ -313,4 +315,4 @@ def _median(arrays):
 def _central_tile(image):
     rows, cols = (min(size, TILE) for size in image.shape)
     row, col = (image.shape[0] - rows) // 2, (image.shape[1] - cols) // 2
-    return np.asarray(image[row : row + rows, col : col + cols], float)
+    return image[row : row + rows, col : col + cols]

@@ -44,6 +44,8 @@ HUBER_SCALE = 3.0  # noise standard errors from which a residual counts as an ou
 class Quadratic:
     """Half the cost around a surface, to second order.
 
+    Its arrays are memory of the `Problem`, overwritten by the next expansion.
+
     Attributes
     ----------
     cost : float
@@ -84,6 +86,7 @@ class Problem:
     albedo_error: float = 0.0
     shadows: list = field(default_factory=list)
     geometry: list = field(default_factory=list)
+    memory: dict = field(default_factory=dict)
 
     def prepare_geometry(self, u):
         """Compute the lattice planes for the surface ``u``."""
@@ -100,20 +103,33 @@ class Problem:
     def expand(self, u):
         """The `Quadratic` of half the cost around ``u``."""
         tensors, gradient, sums, best, albedo_cost = self.assemble(u)
-        at_posts = np.empty_like(u)
+        at_posts = self._array("gradient at posts", u.shape)
         with threads_for(u.shape):
             slope_adjoint(gradient[0], gradient[1], at_posts)
         prior, prior_cost = self.prior_gradient(u)
+        at_posts += prior
         cost = (sums[:, SUM_COST].sum() + albedo_cost) / 2 + prior_cost
-        return Quadratic(float(cost), tensors, at_posts + prior, sums, best)
+        return Quadratic(float(cost), tensors, at_posts, sums, best)
+
+    def _array(self, name, shape):
+        """Memory that serves every step: fresh pages cost as much as filling them."""
+        if name not in self.memory:
+            self.memory[name] = np.empty(shape, np.float32)
+        return self.memory[name]
 
     def assemble(self, u):
-        """Tensors, slope gradient, sums, best albedo and its cost at ``u``; data only."""
+        """Tensors, slope gradient, sums, best albedo and its cost at ``u``; data only.
+
+        The arrays are overwritten by the next call, but for the albedo that has been taken over.
+        """
         lattice, _, _, gram, lights = self.geometry
         shape = self.albedo.shape
-        tensors, gradient = np.empty((3, *shape), np.float32), np.empty((2, *shape), np.float32)
+        tensors, gradient = self._array("tensors", (3, *shape)), self._array("slopes", (2, *shape))
         is_free = self.albedo_error > 0
-        best = np.empty_like(self.albedo) if is_free else self.albedo
+        best = self.albedo
+        if is_free:
+            spare = self._array("albedo", shape)
+            best = spare if spare is not self.albedo else self._array("other albedo", shape)
         weights = self.weights * self.stride**2  # a coarse cell averages stride^2 fine ones
         images = [self.exposures, self.hazes, weights, self.weights / HUBER_SCALE**2]
         with threads_for(u.shape):
@@ -201,11 +217,11 @@ class Problem:
     def prior_gradient(self, u):
         """Gradient of the prior terms at ``u``, and their cost."""
         cols = u.shape[1]
-        change = u - self.expected
+        change = np.subtract(u, self.expected, out=self._array("change", u.shape))
         along, across = (np.full((1, cols - 1), weight) for weight in self.slope)
         none = np.zeros_like(along)
         massless = np.zeros((1, cols), np.float32)
-        out = np.empty_like(u)
+        out = self._array("prior", u.shape)
         with threads_for(u.shape):
             apply_operator(
                 change, along, none, across, self.curvature, np.float32(0), massless, out
@@ -248,6 +264,7 @@ class Problem:
             exposures=self.exposures.copy(),
             stride=2 * self.stride,
             shadows=[],
+            memory={},
             initial=coarse_posts(self.initial),
             expected=coarse_posts(self.expected),
             cells=np.stack([coarse_cells(cells) for cells in self.cells]),

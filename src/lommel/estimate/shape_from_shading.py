@@ -37,6 +37,7 @@ ENOUGH_CELLS = 100_000  # of them tell a correlation to (1 - r^2) 0.3 %
 SHORTEST_STEP = 0.1  # of a Gauss-Newton step: the cost that still rises has no way down
 EXPOSURE_GAIN = 1e-4  # relative, of the cost: exposures that gain less wait for the next step
 ROUNDING = 1e-5  # relative, of a cost summed from float32 residuals
+EXPLAINED = 0.5  # noise standard errors, rms: a surface that leaves less leaves nothing to albedo
 CELL_UNKNOWNS = 3  # two slopes and the albedo: what a cell's values determine
 POOR_FIT = 2.5  # noise standard errors, rms: more is not noise
 POOR_START = 0.25  # of the brightness taken for noise: the initial DEM explains nothing
@@ -154,7 +155,7 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
     u, converged = _coarse_to_fine(finest, settings, history)
     sums = finest.assemble(u)[2]
     misfits = np.sqrt(sums[:, SUM_RR] / np.maximum(sums[:, SUM_COUNT], 1))
-    if settings.estimate_albedo:
+    if settings.estimate_albedo and misfits.max() > EXPLAINED:
         _fit_albedo(finest, u, priors, misfits, settings)
     modelled = [finest.predict(u, k) for k in range(len(views))]
     value = SurfaceSolution(
@@ -191,8 +192,10 @@ def separation(level, u):
     """
     if len(level.views) == 1:
         return np.where(np.isfinite(level.cells[0]), np.float32(0), np.float32(np.nan))
-    bound = replace(level, albedo_error=0.0, slope=np.zeros(2, np.float32)).assemble(u)[0]
-    free = replace(level, albedo_error=np.inf, slope=np.zeros(2, np.float32)).assemble(u)[0]
+    bound, free = (
+        replace(level, albedo_error=error, slope=np.zeros(2, np.float32), memory={}).assemble(u)[0]
+        for error in (0.0, np.inf)
+    )
     signal = bound[0] + bound[2]
     share = (free[0] + free[2]) / np.where(signal > 0, signal, np.nan)
     return np.clip(share, 0, 1)
@@ -233,13 +236,19 @@ def _coarse_to_fine(finest, settings, history):
 
 def _descend(level, u, steps, settings, history):
     """Gauss-Newton steps on one level, shortened where the cost would rise."""
-    here, last_gain = level.expand(u), 0.0
+    here, last_gain, equations = level.expand(u), 0.0, None
     for _ in range(steps):
-        equations = NormalEquations(tuple(here.tensors), level.curvature, level.masses)
+        if equations is None:
+            equations = NormalEquations(here.tensors, level.curvature, level.masses)
+        else:
+            equations.renew(here.tensors)
         linear = conjugate_gradients(
-            equations, -here.gradient, settings.cycle_tolerance, settings.max_cycles
+            equations,
+            np.negative(here.gradient, out=here.gradient),
+            settings.cycle_tolerance,
+            settings.max_cycles,
         )
-        gain = -dot(here.gradient, linear.x) / 2
+        gain = dot(here.gradient, linear.x) / 2
         direction = without_tilt(linear.x) if settings.estimate_exposure else linear.x
         length, last = 1.0, _best_cost(here, level, settings)
         u, start = u + direction, u

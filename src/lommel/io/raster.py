@@ -37,9 +37,9 @@ BLOCK = 512  # pixels along each side of a GeoTIFF's tiles
 WRITING_SPACE = 2.4  # of a raster's plain size, while it is written: itself, overviews, the copy
 COG = {
     "driver": "COG",
-    "compress": "deflate",
+    "compress": "zstd",  # half the time of deflate for the same size
     "predictor": "yes",
-    "level": 1,  # a third less time than the default for 2 % more bytes
+    "level": 1,
     "overview_resampling": "average",
     "num_threads": 2,
 }

@@ -4,6 +4,7 @@ Most callers want `run_shape_from_shading`.
 """
 
 import csv
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
@@ -19,11 +20,13 @@ from lommel.estimate.surface import Surface
 from lommel.io.raster import write_raster
 from lommel.run.inputs import GridSettings, SceneFiles
 from lommel.run.products import RunRecord, output_folder
+from lommel.run.register import settle_cameras
 from lommel.run.views import read_views
 from lommel.scene.grid import Grid
 from lommel.scene.masks import MaskSettings
 
 PARAMETRISATIONS = ("height", "ray")
+WRITERS = 2  # rasters written at a time: each needs twice its size in memory
 LEAST_POSTS = 33  # rows and columns: three octaves of wavelengths
 
 
@@ -40,6 +43,8 @@ class SfsSettings:
     priors : PriorSettings
     solver : SolverSettings
     masks : MaskSettings
+    registers : bool
+        Register raw images to the DEM first; otherwise they are only checked.
     """
 
     parametrisation: str = "height"
@@ -47,6 +52,7 @@ class SfsSettings:
     priors: PriorSettings = field(default_factory=PriorSettings)
     solver: SolverSettings = field(default_factory=SolverSettings)
     masks: MaskSettings = field(default_factory=MaskSettings)
+    registers: bool = False
 
 
 def run_shape_from_shading(
@@ -84,11 +90,12 @@ def run_shape_from_shading(
     record = RunRecord("sfs", asdict(settings) | {"grid": asdict(grid_settings or GridSettings())})
     with output_folder(output, overwrite) as folder:
         with record.stage("read"):
-            scene = read_views(files, grid_settings, settings.masks, progress=progress)
+            settled, lost, remark = settle_cameras(files, folder, settings.registers)
+            scene = read_views(settled, grid_settings, settings.masks, progress=progress)
             record.add_inputs([*files.images, *files.dems])
             tables = (files.sun_positions, files.spacecraft_positions)
             record.add_inputs([*files.cameras, *filter(None, tables)])
-            record.add_skipped(scene.skipped)
+            record.add_skipped([*lost, *scene.skipped])
             _refuse_small(scene.grid)
         with record.stage("solve"):
             known = np.isfinite(scene.heights)
@@ -106,7 +113,7 @@ def run_shape_from_shading(
             _write_exposures(folder, scene.views, record.skipped, solution.value)
         record.results = _results(scene, refined, solution.value)
         record.history = solution.history
-        record.outcome = {"name": solution.outcome, "sentence": solution.advice}
+        record.outcome = {"name": solution.outcome, "sentence": solution.advice + remark}
         record.write(folder)
     return record.results
 
@@ -135,19 +142,22 @@ def _seen_posts(images):
 def _write_products(folder, scene, initial, refined, surface):
     grid = scene.grid
     cells = cell_grid(grid)
-    write_raster(folder / "dem.tif", refined, grid, "height", "m")
-    write_raster(folder / "initial-dem.tif", scene.heights, grid, "height", "m")
+    modelled = np.where(np.isfinite(surface.measured[0]), surface.modelled[0], np.nan)
+    products = {
+        "dem": (refined, grid, "height", "m"),
+        "initial-dem": (scene.heights, grid, "height", "m"),
+        "measured": (surface.measured[0], cells, "measured brightness"),
+        "modelled": (modelled, cells, "modelled brightness"),
+        "albedo": (surface.albedo, cells, "albedo"),
+        "separation": (surface.separation, cells, "slope signal left by a free albedo", "1"),
+        "residual": (relative_residual(surface), cells, "rms of modelled - measured", "percent"),
+    }
     for name, heights in (("before", initial), ("after", refined)):
         shade = hillshade(grid, heights, scene.views[0])
-        write_raster(folder / f"hillshade-{name}.tif", shade, cells, "cosine of incidence", "1")
-    write_raster(folder / "measured.tif", surface.measured[0], cells, "measured brightness")
-    modelled = np.where(np.isfinite(surface.measured[0]), surface.modelled[0], np.nan)
-    write_raster(folder / "modelled.tif", modelled, cells, "modelled brightness")
-    write_raster(folder / "albedo.tif", surface.albedo, cells, "albedo")
-    share = surface.separation
-    write_raster(folder / "separation.tif", share, cells, "slope signal left by a free albedo", "1")
-    residual = relative_residual(surface)
-    write_raster(folder / "residual.tif", residual, cells, "rms of modelled - measured", "percent")
+        products[f"hillshade-{name}"] = (shade, cells, "cosine of incidence", "1")
+    with ThreadPoolExecutor(WRITERS) as pool:  # GDAL compresses outside Python's lock
+        paths = (folder / f"{name}.tif" for name in products)
+        list(pool.map(lambda path, product: write_raster(path, *product), paths, products.values()))
 
 
 def cell_grid(grid):
