@@ -29,6 +29,7 @@ LEAST_OVERLAP = 0.4  # of the largest overlap, for a shift to be looked at
 LEAST_SAMPLES = 8.0  # independent ones, for an octave to be looked at
 CHANCE_PEAK = 5.0  # ln likelihood that the best of a hundred unrelated shifts reaches
 LEAST_GAIN = 10.0  # ln of the likelihood by which a shift must beat the next one
+FLATTEST = 1e-3  # 1 / posts^2; least information that a peak is taken to hold
 LEAST_ERROR = 0.03  # posts; the parabola through the peak is no better
 
 
@@ -171,24 +172,29 @@ def _peak(likelihood, samples, shortest):
     is_inside = around.shape == (3, 3) and bool(np.isfinite(around).all())
     shift, covariance = np.zeros(2), np.eye(2)
     if is_inside:
-        shift, covariance = _parabola(around)
+        shift, covariance = _parabola(np.exp(-2.0 * (around - highest) / samples), samples)
     place = np.array([row, col]) - size // 2
     covariance *= max(1.0, runner_up / CHANCE_PEAK)  # what is no noise makes higher peaks elsewhere
     return Match(place + shift, covariance, highest, runner_up, correlation, is_inside)
 
 
-def _parabola(values):
-    """Maximum of the quadratic through 3 x 3 values, and the inverse of its curvature."""
-    slope = np.array([values[2, 1] - values[0, 1], values[1, 2] - values[1, 0]]) / 2.0
-    middle = 2.0 * values[1, 1]
-    mixed = (values[2, 2] - values[2, 0] - values[0, 2] + values[0, 0]) / 4.0
-    curvature = -np.array(
+def _parabola(misfit, samples):
+    """Minimum of the quadratic through 3 x 3 values of the misfit, and the shift's covariance.
+
+    The misfit 1 - rho^2 is quadratic around its minimum, where its logarithm may have a cusp.
+    """
+    slope = np.array([misfit[2, 1] - misfit[0, 1], misfit[1, 2] - misfit[1, 0]]) / 2.0
+    middle = 2.0 * misfit[1, 1]
+    mixed = (misfit[2, 2] - misfit[2, 0] - misfit[0, 2] + misfit[0, 0]) / 4.0
+    curvature = np.array(
         [
-            [values[2, 1] + values[0, 1] - middle, mixed],
-            [mixed, values[1, 2] + values[1, 0] - middle],
+            [misfit[2, 1] + misfit[0, 1] - middle, mixed],
+            [mixed, misfit[1, 2] + misfit[1, 0] - middle],
         ]
     )
     eigenvalues, axes = np.linalg.eigh(curvature)
-    shift = (axes / np.maximum(eigenvalues, 1e-3)) @ axes.T @ slope
-    covariance = (axes / np.clip(eigenvalues, 1e-3, LEAST_ERROR**-2)) @ axes.T
-    return np.clip(shift, -1.0, 1.0), covariance
+    inverse = (axes / np.maximum(eigenvalues, FLATTEST / samples)) @ axes.T
+    shift = np.clip(-inverse @ slope, -1.0, 1.0)
+    least = max(misfit[1, 1] + slope @ shift / 2.0, LEAST_ERROR**2)
+    information = np.clip(samples / 2.0 * eigenvalues / least, FLATTEST, LEAST_ERROR**-2)
+    return shift, (axes / information) @ axes.T
