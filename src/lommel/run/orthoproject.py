@@ -71,9 +71,10 @@ def run_orthoproject(
             terrain = Terrain(files.dems)
             record.add_inputs([*files.images, *files.dems, *files.cameras])
             done = {}
+            gsd = common_gsd(images, terrain)
             for image in progress(images):
                 try:
-                    grid, relief = ortho_grid(image, terrain, settings)
+                    grid, relief = ortho_grid(image, terrain, settings, gsd)
                     done[image.name] = write_orthoimage(folder, image, grid, terrain, relief)
                 except LommelError as error:
                     skipped.append(Skipped(image.name, str(error)))
@@ -99,8 +100,26 @@ def _sentence(count, without_sun):
     return sentence
 
 
-def ortho_grid(image, terrain, settings):
-    """The grid of an orthoimage: the part of the DEM that the image sees, at the image's spacing.
+def common_gsd(images, terrain):
+    """Median ground sample distance of images on the sphere, to three digits, m.
+
+    Parameters
+    ----------
+    images : list of RawImage
+    terrain : Terrain
+
+    Returns
+    -------
+    gsd : float, m
+        The DEM's spacing when no image meets the body.
+    """
+    found = np.array([image.gsd(0.0, terrain.body) for image in images])
+    found = found[np.isfinite(found)]
+    return float(f"{np.median(found):.3g}") if found.size else terrain.spacing
+
+
+def ortho_grid(image, terrain, settings, gsd):
+    """The grid of an orthoimage: the part of the DEM that the image sees, at the images' spacing.
 
     The DEM's own posts are kept when they are about as far apart as the image's pixels. All images
     of a run lie on one lattice.
@@ -110,6 +129,8 @@ def ortho_grid(image, terrain, settings):
     image : RawImage
     terrain : Terrain
     settings : GridSettings
+    gsd : float, m
+        Of the images of the run.
 
     Returns
     -------
@@ -125,9 +146,6 @@ def ortho_grid(image, terrain, settings):
     )
     extremes = terrain.extremes(area)
     bounds = settings.bounds or seen_bounds(image, crs, terrain, extremes)
-    gsd = image.gsd(np.mean(extremes), terrain.body)
-    if not np.isfinite(gsd):
-        gsd = terrain.spacing
     is_alike = 1 / DEM_IS_FINE_ENOUGH < terrain.spacing / gsd < DEM_IS_FINE_ENOUGH
     if settings.is_automatic and len(terrain.grids) == 1 and is_alike:
         around = grid_from_bounds(bounds, gsd, crs, terrain.body)
