@@ -329,6 +329,16 @@ def info(
     dem: Annotated[
         Path | None, typer.Option(help="DEM on which --pixel looks. Default: the sphere.")
     ] = None,
+    kernels: Annotated[
+        Path | None,
+        typer.Option(
+            help="SPICE meta-kernel: the cameras come from it and the images' ISIS labels, "
+            "without spiceinit."
+        ),
+    ] = None,
+    write_isd: Annotated[
+        Path | None, typer.Option(help="Write the camera of one image as ISD (JSON).")
+    ] = None,
     as_json: Annotated[
         bool,
         typer.Option("--json", help="Print JSON: a list of objects, with --pixel one object."),
@@ -336,25 +346,24 @@ def info(
 ):
     """Show what an image holds: size, place, spacing, camera; where Sun and spacecraft stand."""
     from lommel.run.ground_point import describe_pixel
-    from lommel.run.info import describe
+    from lommel.run.info import describe, named_cameras, write_camera
 
-    named: list[Path | None] = [*cameras] if cameras else [None] * len(files)
-    if len(named) != len(files):
-        raise InputError(f"--cameras names {len(named)} files for {len(files)} images.")
+    if len(files) > 1 and not (pixel is None and write_isd is None):
+        raise InputError(f"--pixel and --write-isd take one image; {len(files)} are given.")
+    if dem is not None and pixel is None:
+        raise InputError("--dem tells where --pixel looks; give --pixel SAMPLE LINE too.")
+    named = named_cameras(files, cameras, kernels)
+    if write_isd is not None:
+        write_camera(write_isd, files[0], named[0])
     if pixel is not None:
-        if len(files) > 1:
-            raise InputError(f"--pixel takes one image; {len(files)} are given.")
-        found = describe_pixel(files[0], *pixel, dem, named[0], sun_positions)
-        facts = [found]
+        facts = [describe_pixel(files[0], *pixel, dem, named[0], sun_positions)]
     else:
-        if dem is not None:
-            raise InputError("--dem tells where --pixel looks; give --pixel SAMPLE LINE too.")
-        found = facts = [
+        facts = [
             describe(path, sun_positions, spacecraft_positions, camera)
             for path, camera in zip(files, named, strict=True)
         ]
     if as_json:
-        typer.echo(json.dumps(found, indent=1))
+        typer.echo(json.dumps(facts if pixel is None else facts[0], indent=1))
         return
     for fact in facts:
         for name, value in fact.items():

@@ -1,26 +1,22 @@
-r"""ISIS cubes with spiceinit's tables, and GeoTIFFs with such a label -> cameras.
+r"""ISIS cubes, and GeoTIFFs with such a label -> cameras.
 
-A cube that was cropped or reduced says so in the group ``AlphaCube``: with sample s counted from
-the image's left edge (CSM), the sample of the full image, counted as ISIS does from 1 at the first
-centre, is
-
-.. math:: \alpha = start + s \, (end - start) / samples.
-
-From there on the instruments differ, see `lommel.io.sensors`. Lines of a NAC image were taken at
-:math:`t = start + \tau (\alpha - 1/2)`. Those are ISIS 9's own relations (``AlphaCube``,
-``LineScanCameraDetectorMap``). Most callers want `read_isis`.
+Position and pointing come from the tables that spiceinit left in the cube, or, where SPICE kernels
+are given, from these (`lommel.io.spice`). Lines of an LRO NAC image were taken at
+:math:`t = start + \tau (\alpha - 1/2)`, alpha the line of the full image (`lommel.io.isis_label`),
+as in ISIS 9 (``LineScanCameraDetectorMap``); the focal planes are those of `lommel.io.sensors`.
+Most callers want `read_isis`.
 """
 
 import struct
-from dataclasses import dataclass
 
 import numpy as np
 
 from lommel.errors import InputError
 from lommel.io.inertial import pointing, trajectory
-from lommel.io.isis_tables import numbers, read_table, table_positions, table_rotations
-from lommel.io.raster import raster_info, read_isis_label
+from lommel.io.isis_label import read_label
+from lommel.io.isis_tables import read_table, table_positions, table_rotations
 from lommel.io.sensors import FLIP, apollo_metric, lro_nac, nac_times
+from lommel.io.spice import Kernels
 from lommel.scene.camera import FrameCamera
 from lommel.scene.line_scan import LineScanCamera
 
@@ -29,15 +25,11 @@ POINTING = "Table_InstrumentPointing"  # spiceinit leaves it
 
 def has_camera(path):
     """True when a raster is an image as it was taken, with an ISIS label and spiceinit's tables."""
-    label = read_isis_label(path)
-    return label is not None and POINTING in label and not _is_projected(path, label)
+    label = read_label(path)
+    return label is not None and POINTING in label.values and not label.is_projected
 
 
-def _is_projected(path, label):
-    return "Mapping" in label.get("IsisCube", {}) or raster_info(path).grid is not None
-
-
-def read_isis(path, shape):
+def read_isis(path, shape, kernels=None):
     """The camera of an ISIS cube, or of a GeoTIFF that carries an ISIS label.
 
     Parameters
@@ -45,181 +37,134 @@ def read_isis(path, shape):
     path : path
     shape : tuple of int
         Lines and samples of the image for which the camera is wanted.
+    kernels : path, optional
+        SPICE meta-kernel; takes the place of the tables, which may then be absent.
 
     Returns
     -------
     camera : FrameCamera or LineScanCamera
     """
-    label = read_isis_label(path)
+    label = read_label(path)
     if label is None:
         raise InputError(
             f"{path} carries no ISIS label, so it tells of no camera. Give the camera as ISD "
             "(.json, .isd) or .tsai."
         )
-    found = raster_info(path).shape
-    if tuple(shape) != found:
+    if tuple(shape) != label.shape:
         raise InputError(
-            f"{path}: the camera belongs to an image of {found[0]} x {found[1]} pixels, but the "
-            f"image has {shape[0]} x {shape[1]}. Name the camera of this very image."
+            f"{path}: the camera belongs to an image of {label.shape[0]} x {label.shape[1]} "
+            f"pixels, but the image has {shape[0]} x {shape[1]}. Name the camera of this very "
+            "image."
         )
-    cube = _Cube(path, label, found)
-    model = MODELS.get(cube.instrument)
+    model = MODELS.get(label.instrument)
     if model is None:
         raise InputError(
-            f"{path}: images of {cube.instrument or 'an unnamed instrument'} "
-            f"({cube.text('SpacecraftName')}) are not supported; those of "
+            f"{path}: images of {label.instrument or 'an unnamed instrument'} "
+            f"({label.text('SpacecraftName')}) are not supported; those of "
             f"{', '.join(MODELS)} are. Give the camera as ISD (isd_generate of ALE)."
         )
-    if _is_projected(path, label):
+    if label.is_projected:
         raise InputError(f"{path} is map-projected: it is an orthoimage and has no camera.")
-    _check_size(cube)
-    return model(cube)
+    label.check_size()
+    if kernels is None:
+        return model(label, _Tables(label))
+    with Kernels(kernels, label) as source:
+        return model(label, source)
 
 
-def _check_size(cube):
-    """Refuse a label that was carried over to an image of another size."""
-    core = cube.group("Core").get("Dimensions", {})
-    said = tuple(numbers(core, key, 1, f"{cube.path}: Core")[0] for key in ("Lines", "Samples"))
-    if said != cube.shape:
-        raise InputError(
-            f"{cube.path}: the ISIS label speaks of {said[0]:g} x {said[1]:g} pixels, the image "
-            f"has {cube.shape[0]} x {cube.shape[1]}. It was cut or resampled by a program that "
-            "leaves the label as it was; do that with ISIS's crop or reduce."
-        )
+class _Tables:
+    """What spiceinit left in a cube; `lommel.io.spice.Kernels` answers the same from kernels."""
 
+    def __init__(self, label):
+        self.label = label
+        self.naif = label.naif
 
-@dataclass(frozen=True)
-class _Cube:
-    """A label with what every camera asks of it."""
+    def rotations(self, name, times):
+        """Rotations from J2000 of InstrumentPointing or BodyRotation, at the table's own times."""
+        return table_rotations(read_table(self.label.path, self.label.values, name))
 
-    path: object
-    label: dict
-    shape: tuple[int, int]
+    def positions(self, name, times):
+        """Positions of InstrumentPosition or SunPosition; None when a cube has no Sun."""
+        if name == "SunPosition" and f"Table_{name}" not in self.label.values:
+            return None
+        return table_positions(read_table(self.label.path, self.label.values, name))
 
-    @property
-    def instrument(self):
-        return self.text("InstrumentId").upper()
+    def shutter_time(self):
+        """Ephemeris time of a frame, s; None: the time of the table."""
+        return None
 
-    def group(self, name):
-        """A group of the object IsisCube."""
-        cube = self.label.get("IsisCube")
-        group = cube.get(name) if isinstance(cube, dict) else None
-        return group if isinstance(group, dict) else {}
+    def clock_time(self, count):
+        """Ephemeris time of a count of the spacecraft's clock, s; spiceinit computed it.
 
-    def text(self, key):
-        value = self.group("Instrument").get(key, "")
-        return value if isinstance(value, str) else str(value)
-
-    def naif(self, key, count):
-        """Numbers from NaifKeywords for this instrument."""
-        keywords = self.label.get("NaifKeywords")
-        keywords = keywords if isinstance(keywords, dict) else {}
-        name = f"INS{int(self.kernel_code)}_{key}"
-        return numbers(keywords, name, count, f"{self.path}: NaifKeywords")
-
-    @property
-    def kernel_code(self):
-        return numbers(self.group("Kernels"), "NaifFrameCode", 1, f"{self.path}: Kernels")[0]
-
-    def instrument_number(self, key):
-        return numbers(self.group("Instrument"), key, 1, f"{self.path}: Instrument")[0]
-
-    @property
-    def full_shape(self):
-        """Lines and samples of the image before it was cut or reduced."""
-        alpha = self.group("AlphaCube")
-        if not alpha:
-            return self.shape
-        return tuple(self._alpha(f"Alpha{axis}s") for axis in ("Line", "Sample"))
-
-    def alpha(self, axis):
-        """Start and step: sample or line of the full image, ISIS's, from this image's, CSM's."""
-        alpha = self.group("AlphaCube")
-        if not alpha:
-            return 0.5, 1.0
-        start, end = (self._alpha(f"Alpha{edge}{axis}") for edge in ("Starting", "Ending"))
-        count = self._alpha(f"Beta{axis}s")
-        size = self.shape[0 if axis == "Line" else 1]
-        if count != size or not end > start:
+        The keyword holds the bytes of a little-endian double.
+        """
+        name = f"CLOCK_ET_{int(self.label.kernel_code / 1000)}_{count}_COMPUTED"
+        text = self.label.naif_text(name)
+        try:
+            return struct.unpack("<d", bytes.fromhex(text))[0]
+        except (ValueError, struct.error) as error:
             raise InputError(
-                f"{self.path}: AlphaCube speaks of {count:g} {axis.lower()}s from {start:g} to "
-                f"{end:g}, the image has {size}. The label is damaged, or the image was cut by a "
-                "program that does not know it; cut it with ISIS's crop or reduce."
-            )
-        return start, (end - start) / size
-
-    def _alpha(self, key):
-        return numbers(self.group("AlphaCube"), key, 1, f"{self.path}: AlphaCube")[0]
-
-    def rotations(self, name):
-        return table_rotations(read_table(self.path, self.label, name))
-
-    def positions(self, name):
-        return table_positions(read_table(self.path, self.label, name))
-
-    def sun(self, body):
-        """The Sun's trajectory, or None when spiceinit left none."""
-        has_sun = "Table_SunPosition" in self.label
-        return trajectory(self.positions("SunPosition"), body) if has_sun else None
+                f"{self.label.path}: NaifKeywords holds no {name}, the time of the clock count, "
+                f"as 16 hexadecimal digits, but {text}. Run spiceinit again, or give an ISD."
+            ) from error
 
 
-def _apollo_metric(cube):
+def _apollo_metric(label, source):
     """Frame camera of Apollo 15, 16 and 17; the film is scanned, its centre is the origin."""
-    axes = zip(("Line", "Sample"), cube.full_shape, strict=True)
-    starts = [(start - size / 2, step) for axis, size in axes for start, step in [cube.alpha(axis)]]
-    body = cube.rotations("BodyRotation")
-    camera = cube.rotations("InstrumentPointing")
-    sun = cube.sun(body)
-    time = camera.times.mean()
+    (line, line_step), (sample, sample_step) = label.alpha("Line"), label.alpha("Sample")
+    lines, samples = label.full_shape
+    time = source.shutter_time()
+    camera = source.rotations("InstrumentPointing", [time])
+    time = camera.times.mean() if time is None else time
+    body, place, sun = _surroundings(source, [time])
     return FrameCamera(
-        position=trajectory(cube.positions("InstrumentPosition"), body).at(time),
+        position=place.at(time),
         rotation=FLIP @ pointing(camera, body).at(time),
-        shape=cube.shape,
+        shape=label.shape,
         sun_position=None if sun is None else sun.at(time),
-        **apollo_metric(cube.naif, *starts),
-    )
-
-
-def _lro_nac(cube):
-    """Line-scan camera of the Lunar Reconnaissance Orbiter, left or right."""
-    start, period = nac_times(
-        cube.naif, _preroll_time(cube), cube.instrument_number("LineExposureDuration") / 1e3
-    )
-    first, step = cube.alpha("Line")
-    body = cube.rotations("BodyRotation")
-    return LineScanCamera(
-        trajectory=trajectory(cube.positions("InstrumentPosition"), body),
-        pointing=pointing(cube.rotations("InstrumentPointing"), body),
-        line_times=np.array([[0.0, start + period * (first - 0.5), period * step]]),
-        shape=cube.shape,
-        sun_trajectory=cube.sun(body),
-        **lro_nac(
-            cube.naif,
-            *cube.alpha("Sample"),
-            cube.instrument_number("SpatialSumming"),
-            cube.instrument_number("SampleFirstPixel"),
+        **apollo_metric(
+            source.naif, (line - lines / 2, line_step), (sample - samples / 2, sample_step)
         ),
     )
 
 
-def _preroll_time(cube):
-    """Ephemeris time of the clock count at the preroll, s; spiceinit computed it.
+def _lro_nac(label, source):
+    """Line-scan camera of the Lunar Reconnaissance Orbiter, left or right."""
+    preroll = source.clock_time(label.text("SpacecraftClockPrerollCount"))
+    start, period = nac_times(source.naif, preroll, label.number("LineExposureDuration") / 1e3)
+    first, step = label.alpha("Line")
+    start, period = start + period * (first - 0.5), period * step
+    times = start + period * np.linspace(0, label.shape[0], _knots(label.shape[0]))
+    body, place, sun = _surroundings(source, times)
+    return LineScanCamera(
+        trajectory=place,
+        pointing=pointing(source.rotations("InstrumentPointing", times), body),
+        line_times=np.array([[0.0, start, period]]),
+        shape=label.shape,
+        sun_trajectory=sun,
+        **lro_nac(
+            source.naif,
+            *label.alpha("Sample"),
+            label.number("SpatialSumming"),
+            label.number("SampleFirstPixel"),
+        ),
+    )
 
-    The keyword holds the bytes of a little-endian double. Its name contains a slash, at which
-    GDAL nests it.
-    """
-    count = cube.text("SpacecraftClockPrerollCount")
-    name = f"CLOCK_ET_{int(cube.kernel_code / 1000)}_{count}_COMPUTED"
-    value = cube.label.get("NaifKeywords", {})
-    for part in [name] if name in value else name.split("/"):
-        value = value.get(part) if isinstance(value, dict) else None
-    try:
-        return struct.unpack("<d", bytes.fromhex(str(value)))[0]
-    except (ValueError, struct.error) as error:
-        raise InputError(
-            f"{cube.path}: NaifKeywords holds no {name}, the time of the clock count, as 16 "
-            f"hexadecimal digits, but {value}. Run spiceinit again, or give an ISD."
-        ) from error
+
+def _knots(lines):
+    """Times of an image at which kernels are asked: every fourth line, 2 to 16 385."""
+    return int(np.clip(lines // 4 + 1, 2, 2**14 + 1))
+
+
+def _surroundings(source, times):
+    """The body's rotation, and the trajectories of camera and Sun."""
+    body = source.rotations("BodyRotation", times)
+    sun = source.positions("SunPosition", times)
+    return (
+        body,
+        trajectory(source.positions("InstrumentPosition", times), body),
+        None if sun is None else trajectory(sun, body),
+    )
 
 
 MODELS = {"METRIC": _apollo_metric, "NACL": _lro_nac, "NACR": _lro_nac}

@@ -14,6 +14,7 @@ from lommel.io.positions import find_position, read_positions
 from lommel.io.raster import raster_info, read_grid
 from lommel.run.inputs import known_heights
 from lommel.scene.body import MOON, local_frame, to_lonlat, to_xyz
+from lommel.scene.camera import Camera
 from lommel.scene.geometry import unit
 from lommel.scene.intersection import meet_sphere, meet_terrain
 
@@ -34,7 +35,7 @@ def describe_pixel(path, sample, line, dem=None, camera=None, sun_positions=None
         CSM coordinates: (0.5, 0.5) is the centre of the first pixel.
     dem : path, optional
         The sphere when there is none.
-    camera : path, optional
+    camera : path or Camera, optional
         The file beside the image, or the image itself, when there is none.
     sun_positions : path, optional
         Table for a camera that tells nothing of the Sun.
@@ -46,7 +47,7 @@ def describe_pixel(path, sample, line, dem=None, camera=None, sun_positions=None
         Incidence and emission are those of the terrain; with a DEM the ones of a horizontal
         surface are named ``ellipsoid_...``. Without any Sun there is neither incidence nor phase.
     """
-    model = image_camera(path, camera)
+    model = camera if isinstance(camera, Camera) else image_camera(path, camera)
     lines, samples = model.shape
     if not model.contains(line, sample):
         raise InputError(
@@ -85,7 +86,7 @@ def describe_pixel(path, sample, line, dem=None, camera=None, sun_positions=None
 
 
 def image_camera(path, camera=None):
-    """The camera of an image: named, beside it, or in it."""
+    """The camera of an image: in the file that is named, beside it, or in it."""
     shape = raster_info(path).shape
     camera = camera or find_camera(path)
     if camera is None:

@@ -5,15 +5,51 @@ Most callers want `describe`.
 
 import numpy as np
 
+from lommel.errors import InputError
 from lommel.io.cameras import find_camera, read_camera
+from lommel.io.isd import write_isd
+from lommel.io.isis import read_isis
 from lommel.io.positions import find_position, read_positions
 from lommel.io.raster import raster_info
 from lommel.run.camera_facts import camera_facts
+from lommel.run.ground_point import image_camera
 from lommel.scene.body import MOON, local_frame, to_lonlat, to_xyz
+from lommel.scene.camera import Camera
 from lommel.scene.geometry import unit, viewing_geometry
 
 DECIMALS_DEG = 6  # 3 cm on the Moon
 DECIMALS_M = 3
+
+
+def named_cameras(files, cameras=None, kernels=None):
+    """One entry per image: its camera from SPICE kernels, the file that was named for it, or None.
+
+    Parameters
+    ----------
+    files : sequence of path
+    cameras : sequence of path, optional
+    kernels : path, optional
+        SPICE meta-kernel.
+
+    Returns
+    -------
+    cameras : list of Camera, path or None
+    """
+    if cameras and kernels:
+        raise InputError("--cameras and --kernels both give cameras. Use one of them.")
+    if kernels:
+        return [read_isis(path, raster_info(path).shape, kernels) for path in files]
+    if cameras and len(cameras) != len(files):
+        raise InputError(
+            f"--cameras names {len(cameras)} files for {len(files)} images. Name one per image, "
+            "in the same order."
+        )
+    return list(cameras) if cameras else [None] * len(files)
+
+
+def write_camera(isd, path, camera=None):
+    """Write an image's camera as ISD; arguments as of `describe`."""
+    write_isd(isd, camera if isinstance(camera, Camera) else image_camera(path, camera))
 
 
 def describe(path, sun_positions=None, spacecraft_positions=None, camera=None, body=MOON):
@@ -28,8 +64,8 @@ def describe(path, sun_positions=None, spacecraft_positions=None, camera=None, b
         Position tables. With the Sun come the subsolar point and the light at the image's centre,
         with the spacecraft the subspacecraft point and the view, with both the phase. A camera
         knows its own place, and mostly the Sun's.
-    camera : path, optional
-        File with the image's camera; beside the image or in it when there is none.
+    camera : path or Camera, optional
+        The image's camera; the file beside the image, or the image itself, when there is none.
     body : Body
 
     Returns
@@ -50,12 +86,14 @@ def describe(path, sun_positions=None, spacecraft_positions=None, camera=None, b
         "crs": info.grid.crs.name if info.grid else None,
     }
     if camera is not None:
-        model = read_camera(camera, info.shape)
+        model = camera if isinstance(camera, Camera) else read_camera(camera, info.shape)
         sun = None
         if model.sun_position is None and sun_positions is not None:
             table = read_positions(sun_positions, "sun", body)
             sun = find_position(table, info.path.name, sun_positions)
-        return facts | {"camera_file": str(camera)} | camera_facts(str(path), model, sun, body)
+        if model is not camera:
+            facts["camera_file"] = str(camera)
+        return facts | camera_facts(str(path), model, sun, body)
     if info.grid:
         facts |= _place(info.grid)
     sun, spacecraft = (
