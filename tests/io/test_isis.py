@@ -202,17 +202,24 @@ def test_reduced_crop_of_a_line_scan_image_shows_the_same_ground(tmp_path):
     )
 
 
-def geotiff_of(cube, path, **changes):
-    """A GeoTIFF with the cube's label as GDAL 3.12 keeps it: tables as hexadecimal text."""
-    label = read_isis_label(cube) | changes
+TIFF = {"driver": "GTiff", "dtype": "float32", "count": 1}
+
+
+def with_table_bytes(label, cube):
+    """A label as GDAL 3.12 carries it: tables as hexadecimal text."""
     data = cube.read_bytes()
     for key, table in label.items():
         if key.startswith("Table_"):
             start = table["StartByte"] - 1
             table["_data"] = data[start : start + table["Bytes"]].hex().upper()
+    return label
+
+
+def geotiff_of(cube, path, **changes):
+    """A GeoTIFF with the pixels and the label of a cube."""
+    label = with_table_bytes(read_isis_label(cube) | changes, cube)
     values = read_pixels(cube)
-    profile = {"driver": "GTiff", "dtype": "float32", "count": 1}
-    with rasterio.open(path, "w", height=values.shape[0], width=values.shape[1], **profile) as file:
+    with rasterio.open(path, "w", height=values.shape[0], width=values.shape[1], **TIFF) as file:
         file.write(values, 1)
         file.update_tags(ns="json:ISIS3", doc=json.dumps(label))
     return path
@@ -337,9 +344,7 @@ def test_table_left_behind_by_an_older_gdal_is_an_error(tmp_path):
     cube = write_cube(tmp_path / "a.cub")
     label = read_isis_label(cube)
     values = read_pixels(cube)
-    with rasterio.open(
-        tmp_path / "a.tif", "w", driver="GTiff", dtype="float32", count=1, height=20, width=30
-    ) as file:
+    with rasterio.open(tmp_path / "a.tif", "w", height=20, width=30, **TIFF) as file:
         file.write(values, 1)
         file.update_tags(ns="json:ISIS3", doc=json.dumps(label))
     with pytest.raises(InputError, match="not all there|length"):
@@ -407,6 +412,50 @@ def test_damaged_cube_gives_a_camera_or_an_error(tmp_path, data):
     path.write_bytes(content)
     try:
         camera = read_camera(path, (4, 5))
+    except LommelError:
+        return
+    assert np.isfinite(camera.position).all()
+
+
+JUNK = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=3)),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=3), inner)
+    ),
+    max_leaves=5,
+)
+
+
+def places(value, path=()):
+    """Paths of everything in nested dicts."""
+    yield path
+    for key, inner in value.items() if isinstance(value, dict) else ():
+        yield from places(inner, (*path, key))
+
+
+@settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(st.data())
+@pytest.mark.filterwarnings(f"ignore::{NotGeoreferencedWarning.__module__}.NotGeoreferencedWarning")
+def test_damaged_label_of_a_geotiff_gives_a_camera_or_an_error(tmp_path, data):
+    """Any part of the JSON becomes any JSON."""
+    cube = tmp_path / "good.cub"
+    if not cube.exists():
+        write_cube(cube, (4, 5))
+    label = with_table_bytes(read_isis_label(cube), cube)
+    for _ in range(data.draw(st.integers(1, 3))):
+        *folders, key = data.draw(st.sampled_from([path for path in places(label) if path]))
+        part = label
+        for folder in folders:
+            part = part[folder]
+        part[key] = data.draw(JUNK)
+    tiff = tmp_path / "bad.tif"
+    with rasterio.open(tiff, "w", height=4, width=5, **TIFF) as file:
+        file.write(np.ones((4, 5), np.float32), 1)
+        file.update_tags(ns="json:ISIS3", doc=json.dumps(label))
+    try:
+        camera = read_camera(tiff, (4, 5))
     except LommelError:
         return
     assert np.isfinite(camera.position).all()
