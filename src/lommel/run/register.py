@@ -1,15 +1,17 @@
 """The stage `lommel register`: images, cameras and a DEM in, corrected cameras out.
 
-`run_register` is the command; `register_images` does the work; `visible_offset` is the cheap check
-for other stages.
+`run_register` is the command; `register_images` does the work; `settle_cameras` checks or registers
+the raw images of other stages.
 """
 
 import csv
+from contextlib import suppress
 from dataclasses import asdict, replace
 
 import numpy as np
 
 from lommel.errors import GeometryError, LommelError
+from lommel.io.cameras import find_camera
 from lommel.io.isd import write_isd
 from lommel.run.inputs import SceneFiles, Skipped, listing
 from lommel.run.products import RunRecord, output_folder
@@ -124,21 +126,83 @@ def register_images(images, terrain, settings, progress=iter):
     return states, failed
 
 
-def visible_offset(image, terrain, settings=None):
+def settle_cameras(files, folder, registers=False):
+    """Cameras of raw images, registered or only checked, before another stage uses them.
+
+    Parameters
+    ----------
+    files : SceneFiles
+        Orthoimages, which have no camera, are left as they are.
+    folder : Path
+        Where registered cameras are written.
+    registers : bool
+        Without it, images that are visibly off are only named.
+
+    Returns
+    -------
+    files : SceneFiles
+        With the registered cameras, without images that could not be registered.
+    lost : list of Skipped
+    remark : str
+        A sentence on what was found; empty when all is well.
+    """
+    cameras = files.cameras or tuple(find_camera(path) for path in files.images)
+    known = {p: c for p, c in zip(files.images, cameras, strict=False) if c is not None}
+    if not known or not files.dems or len(cameras) != len(files.images):
+        return files, [], ""
+    raw = replace(files, images=tuple(known), cameras=tuple(known.values()))
+    images, _ = read_raw_images(raw)  # what cannot be read is reported by the stage itself
+    images = [image for image in images if image.sun is not None]
+    terrain, settings = Terrain(files.dems), RegistrationSettings()
+    if not registers:
+        return files, [], _remark(images, terrain, settings)
+    states, _ = register_images(images, terrain, settings)
+    found = placed(states)
+    lost = []
+    for number, state in enumerate(states):
+        if number in found:
+            known[state.image.path] = folder / _camera_name(state)
+            write_isd(known[state.image.path], with_sun(state.corrected))
+        else:
+            lost.append(Skipped(state.image.name, why_lost(state, settings)))
+    names = {skip.name for skip in lost}
+    if len(names) == len(files.images):
+        raise GeometryError("No image could be registered.\n" + listing(lost))
+    kept = tuple(path for path in files.images if path.name not in names)
+    files = replace(files, images=kept, cameras=tuple(known.get(path) for path in kept))
+    moved = [np.linalg.norm(states[number].shift) for number in found]
+    remark = f" Registering moved the images by {np.median(moved):.1f} px." if moved else ""
+    return files, lost, remark
+
+
+def _remark(images, terrain, settings):
+    off = {}
+    for image in images:
+        with suppress(LommelError):  # reported by the stage itself
+            off[image.name] = visible_offset(image, terrain, settings)
+    seen = [f"{name} by {offset:.0f} m" for name, offset in off.items() if offset > 0]
+    if not seen:
+        return ""
+    return (
+        f" Warning: images do not lie on the DEM: {', '.join(seen[:5])}. Use --register, or "
+        "lommel register first."
+    )
+
+
+def visible_offset(image, terrain, settings):
     """How far an image is visibly off the terrain; a second's check of the image as a whole.
 
     Parameters
     ----------
     image : RawImage
     terrain : Terrain
-    settings : RegistrationSettings, optional
+    settings : RegistrationSettings
 
     Returns
     -------
     offset : float, m
         0 when the image lies where its camera says, or when the terrain does not tell.
     """
-    settings = settings or RegistrationSettings()
     state, _, spacing = place_whole(image, terrain, settings, CHECK_POSTS)
     whole = state.whole
     if whole is None or not whole.is_distinct:
