@@ -269,22 +269,22 @@ def show_pixels(image, tile):
     -------
     values : float32 array (rows, cols)
     """
-    values = _sample(image, tile.line, tile.sample)
+    values = _sample(image, tile.line, tile.sample, tile.per_post)
     values[~tile.is_seen] = np.nan
     return values
 
 
-def _sample(image, line, sample):
+def _sample(image, line, sample, per_post):
     """Values of posts, quarter by quarter where they show more than fits in memory."""
     part = needed_pixels(line, sample, image.camera.shape)
     if part.is_empty:
         return np.full(line.shape, np.nan, np.float32)
     if part.rows * part.cols <= PIXELS_AT_ONCE or min(line.shape) < 8:
         pixels = read_pixels(image.path, part)
-        return resample_image(pixels, line - part.row, sample - part.col)
+        return resample_image(pixels, line - part.row, sample - part.col, per_post)
     values = np.empty(line.shape, np.float32)
     for rows in np.array_split(np.arange(line.shape[0]), 2):
         for cols in np.array_split(np.arange(line.shape[1]), 2):
             quarter = np.s_[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
-            values[quarter] = _sample(image, line[quarter], sample[quarter])
+            values[quarter] = _sample(image, line[quarter], sample[quarter], per_post[:, *quarter])
     return values

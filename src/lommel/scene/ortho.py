@@ -27,6 +27,8 @@ class GroundTile:
     ----------
     line, sample : array (rows, cols), px
         Image coordinates; NaN where the camera does not look.
+    per_post : array (4, rows, cols), px
+        Change of line and sample from row to row, then from column to column.
     geometry : ViewingGeometry
         NaN where the terrain is unknown; incidence and phase also without a Sun. Posts off the
         image take Sun and camera from its nearest pixel.
@@ -40,6 +42,7 @@ class GroundTile:
 
     line: np.ndarray
     sample: np.ndarray
+    per_post: np.ndarray
     geometry: ViewingGeometry
     is_on_image: np.ndarray
     is_lit: np.ndarray
@@ -70,8 +73,10 @@ def ground_tile(grid, heights, window, camera, sun_position=None):
     inside = window.relative_to(rim).slices
     xyz = grid.cut(rim).xyz(heights[rim.slices])
     normals = surface_normals(xyz)[inside]
-    xyz = np.ascontiguousarray(xyz[inside])
-    line, sample = camera.project(xyz)
+    places = camera.project(xyz)
+    per_post = np.stack([np.gradient(x, axis=axis)[inside] for axis in (0, 1) for x in places])
+    line, sample = (place[inside] for place in places)
+    xyz = xyz[inside]
     pixel = [
         np.clip(np.where(np.isfinite(place), place, size / 2), 0.0, size)
         for place, size in zip((line, sample), camera.shape, strict=True)
@@ -88,7 +93,7 @@ def ground_tile(grid, heights, window, camera, sun_position=None):
         geometry.cos_incidence[:] = geometry.phase[:] = np.nan
     else:
         is_lit = (geometry.cos_incidence > 0) & sunlit(grid, heights, sun, window)
-    return GroundTile(line, sample, geometry, is_on_image, is_lit, is_seen)
+    return GroundTile(line, sample, per_post, geometry, is_on_image, is_lit, is_seen)
 
 
 def _sun(camera, sun_position, pixel):
@@ -124,7 +129,7 @@ def needed_pixels(line, sample, shape, margin=2):
     return window.intersection(Window(0, 0, *shape))
 
 
-def resample_image(image, line, sample):
+def resample_image(image, line, sample, per_post):
     """Image values at the posts of a tile: means over each post's area, or interpolated.
 
     A post that spans more than `AREA_MEAN_FROM` pixels gets the mean over the parallelogram that
@@ -137,13 +142,14 @@ def resample_image(image, line, sample):
         NaN where missing.
     line, sample : array (rows, cols), px
         CSM coordinates within the array.
+    per_post : array (4, rows, cols), px
+        See `GroundTile`.
 
     Returns
     -------
     values : float32 array (rows, cols), NaN outside the image and where it is missing
     """
     values = np.empty(line.shape, np.float32)
-    per_post = [np.gradient(x, axis=axis) for axis in (0, 1) for x in (line, sample)]
     with threads_for(values.shape):
         _resample(image, line - 0.5, sample - 0.5, *per_post, values)
     return values
