@@ -3,7 +3,7 @@ import pytest
 from scipy.fft import irfft2, rfft2
 from scipy.ndimage import fourier_shift, gaussian_filter
 
-from lommel.estimate.registration_matching import band, match
+from lommel.estimate.registration_matching import bands, match
 
 REACH = 12  # posts
 PEAK = 0.05  # posts; the parabola through a sampled peak
@@ -90,6 +90,6 @@ def test_pictures_without_common_ground_do_not_match():
 
 
 def test_a_flat_picture_has_no_waves():
-    assert (band(np.full((40, 40), 3.0), 4.0) == 0).all()
+    assert (next(bands(np.full((40, 40), 3.0), np.array([4.0]))) == 0).all()
     found = match(np.full((60, 60), 3.0), relief(1, 60 + 2 * REACH), REACH)
     assert found is None or not found.is_distinct

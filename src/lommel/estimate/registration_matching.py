@@ -72,34 +72,34 @@ def octaves(shape, shortest):
     return shortest * 2.0 ** np.arange(count)
 
 
-def band(values, wavelength):
-    """One octave of a picture: its waves between one and two wavelengths, 0 where unknown.
+def bands(values, wavelengths):
+    """Octaves of a picture: its waves from each wavelength to the double, 0 where unknown.
 
     Parameters
     ----------
     values : array (rows, cols)
         NaN where unknown; unknown places do not leak.
-    wavelength : float, posts
+    wavelengths : float array (n,), posts
+        Each twice the one before.
 
-    Returns
-    -------
+    Yields
+    ------
     octave : float64 array (rows, cols)
         Of mean square 1 where known; no value beyond `CLIP`.
     """
     known = np.isfinite(values)
     filled = np.where(known, values, 0.0).astype(float)
-    fine, coarse = (
-        _smooth(filled, known, SIGMA_PER_WAVELENGTH * length)
-        for length in (wavelength, 2.0 * wavelength)
-    )
-    octave = np.where(known, fine - coarse, 0.0)
-    rms = np.sqrt(np.mean(octave[known] ** 2)) if known.any() else 0.0
-    if not rms > 1e-12 * np.abs(filled).max(initial=0.0):
-        return np.zeros_like(filled)
-    return np.clip(octave / rms, -CLIP, CLIP)
+    floor = 1e-12 * np.abs(filled).max(initial=0.0)
+    fine = _smooth(filled, known, wavelengths[0])
+    for wavelength in wavelengths:
+        coarse = _smooth(filled, known, 2.0 * wavelength)
+        octave, fine = np.where(known, fine - coarse, 0.0), coarse
+        rms = np.sqrt(np.mean(octave[known] ** 2)) if known.any() else 0.0
+        yield np.clip(octave / rms, -CLIP, CLIP) if rms > floor else np.zeros_like(filled)
 
 
-def _smooth(filled, known, sigma):
+def _smooth(filled, known, wavelength):
+    sigma = SIGMA_PER_WAVELENGTH * wavelength
     weight = gaussian_filter(known.astype(float), sigma, mode="constant")
     return gaussian_filter(filled, sigma, mode="constant") / np.maximum(weight, 1e-6)
 
@@ -130,8 +130,8 @@ def match(first, second, reach, shortest=SHORTEST):
         return None
     is_allowed = overlap >= LEAST_OVERLAP * overlap.max()
     total, samples = np.zeros(overlap.shape), 0.0
-    for wavelength in octaves(first.shape, max(shortest, SHORTEST)):
-        a, b = band(first, wavelength), band(second, wavelength)
+    wavelengths = octaves(first.shape, max(shortest, SHORTEST))
+    for a, b in zip(bands(first, wavelengths), bands(second, wavelengths), strict=True):
         spectra = rfft2(a, shape), rfft2(b, shape)
         power = _correlate(rfft2(a * a, shape), rfft2(known_second, shape), shape, reach)
         power *= _correlate(rfft2(known_first, shape), rfft2(b * b, shape), shape, reach)
