@@ -180,6 +180,9 @@ def sfs(
         bool, typer.Option(help="Give albedo what shading cannot explain; otherwise it is 1.")
     ] = True,
     max_steps: Annotated[int, typer.Option(min=1, help="Gauss-Newton steps on the full grid.")] = 8,
+    registers: Annotated[
+        bool, typer.Option("--register", help="Register raw images to the DEM first.")
+    ] = False,
     reflectance: Reflectance = "lunar-lambert",
     shadow_threshold: ShadowThreshold = None,
     spacing: Spacing = None,
@@ -209,6 +212,7 @@ def sfs(
             estimate_albedo=estimate_albedo,
         ),
         masks=MaskSettings(shadow_threshold=shadow_threshold),
+        registers=registers,
     )
     files = _files(images, dem, sun_positions, spacecraft_positions, positions_unit, cameras)
     grid = _grid(spacing, crs, bounds)
