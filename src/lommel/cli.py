@@ -179,6 +179,12 @@ def sfs(
     estimate_albedo: Annotated[
         bool, typer.Option(help="Give albedo what shading cannot explain; otherwise it is 1.")
     ] = True,
+    albedo: Annotated[
+        Path | None, typer.Option(help="Known albedo, as albedo.tif of a run; held fixed.")
+    ] = None,
+    exposures: Annotated[
+        Path | None, typer.Option(help="Known exposures, as exposures.csv of a run; held fixed.")
+    ] = None,
     max_steps: Annotated[int, typer.Option(min=1, help="Gauss-Newton steps on the full grid.")] = 8,
     registers: Annotated[
         bool, typer.Option("--register", help="Register raw images to the DEM first.")
@@ -212,6 +218,8 @@ def sfs(
             estimate_albedo=estimate_albedo,
         ),
         masks=MaskSettings(shadow_threshold=shadow_threshold),
+        albedo=None if albedo is None else str(albedo),
+        exposures=None if exposures is None else str(exposures),
         registers=registers,
     )
     files = _files(images, dem, sun_positions, spacecraft_positions, positions_unit, cameras)

@@ -283,3 +283,23 @@ def test_surface_does_not_depend_on_the_number_of_threads():
             numba.set_num_threads(threads)
         answers.append(solution.value.u)
     np.testing.assert_array_equal(*answers)
+
+
+def test_known_albedo_and_exposures_are_held_and_used():
+    """Patches of 30 % under one Sun spoil the surface, unless their albedo is given."""
+    truth, initial = rough_scene()
+    grid = patch_grid(*truth.shape)
+    rng = np.random.default_rng(3)
+    patches = 1 + 0.3 * np.sign(gaussian_filter(rng.normal(size=grid.shape), 12))
+    view = simulated_views(truth, grid, (100.0,))[0]
+    view = view.with_image((view.image * patches).astype(np.float32))
+    albedo = ((patches[1:, 1:] + patches[:-1, :-1]) / 2).astype(np.float32)
+    surface = Surface(grid, 0.0)
+    known = np.array([EXPOSURE]), np.array([0.0])
+    told, alone = (
+        solve_surface(surface, initial, [view], reflectance_model(), albedo=a, photometry=p).value
+        for a, p in ((albedo, known), (None, None))
+    )
+    assert told.exposures[0] == EXPOSURE and told.hazes[0] == 0.0
+    assert np.array_equal(told.albedo, albedo)
+    assert rms(told.u - truth) < 0.8 * rms(alone.u - truth)

@@ -39,7 +39,7 @@ def fit_albedo(shading, measured, noise, contrast, start):
 
     Returns
     -------
-    albedo : float32 array (rows, cols), mean 1
+    albedo : float32 array (rows, cols)
     """
     weight, pull = _information(shading, measured, noise)
     albedo = start
@@ -47,7 +47,7 @@ def fit_albedo(shading, measured, noise, contrast, start):
     for _ in range(REWEIGHTINGS):
         albedo = albedo + _step(albedo, weight, pull, stiffness)
         stiffness = _reweighted(albedo, contrast)
-    return albedo / np.float32(albedo.mean(dtype=float))
+    return albedo
 
 
 def observed_contrast(shading, measured, noise):

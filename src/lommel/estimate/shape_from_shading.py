@@ -86,7 +86,8 @@ class SurfaceSolution:
     ----------
     u : float32 array (rows, cols), m
         Unknowns of the surface at the posts.
-    albedo : float32 array (rows - 1, cols - 1), mean 1
+    albedo : float32 array (rows - 1, cols - 1)
+        Of mean 1 where exposures are estimated.
     exposures, hazes : array (images,)
     measured : list of float32 array (rows - 1, cols - 1), image units
         Images on the cells of the refined surface; NaN where not used.
@@ -114,7 +115,9 @@ class SurfaceSolution:
     priors: Priors
 
 
-def solve_surface(surface, initial, views, model, priors=None, settings=None, albedo=None):
+def solve_surface(
+    surface, initial, views, model, priors=None, settings=None, albedo=None, photometry=None
+):
     """Refine a surface by the shading in images.
 
     Parameters
@@ -128,7 +131,9 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
         Estimated from images and initial DEM where not given.
     settings : SolverSettings, optional
     albedo : float32 array (rows - 1, cols - 1), optional
-        Known albedo on the cells; 1 by default.
+        Known albedo on the cells, held fixed.
+    photometry : (array (images,), array (images,)), image units, optional
+        Known exposures and hazes, held fixed.
 
     Returns
     -------
@@ -136,16 +141,25 @@ def solve_surface(surface, initial, views, model, priors=None, settings=None, al
         Its value is a `SurfaceSolution`.
     """
     settings = settings or SolverSettings()
+    if albedo is not None:
+        settings = replace(settings, estimate_albedo=False)
+    if photometry is not None:
+        settings = replace(settings, estimate_exposure=False, estimate_haze=False)
     finest = fresh_problem(surface, initial, views, model, albedo)
     finest.prepare_geometry(finest.initial)
     finest.sample_images(finest.initial)
     finest.find_shadows(finest.initial)
-    # a blurred DEM explains part of the contrast only: haze would seem to explain the rest
-    first_sums = finest.assemble(finest.initial)[2]
-    _set_photometry(finest, first_sums, replace(settings, estimate_haze=False))
+    if photometry is None:
+        # a blurred DEM explains part of the contrast only: haze would seem to explain the rest
+        first_sums = finest.assemble(finest.initial)[2]
+        _set_photometry(finest, first_sums, replace(settings, estimate_haze=False))
+    else:
+        finest.exposures, finest.hazes = (np.array(values, float) for values in photometry)
     if not isinstance(priors, Priors):
         spacing = (surface.grid.spacing[0] * surface.grid.spacing[1]) ** 0.5
         priors = (priors or PriorSettings()).applied_to(_estimate_priors(finest), spacing)
+    if not settings.estimate_albedo:
+        priors = replace(priors, albedo_error=0.0)
     finest.expect(priors)
     correlations = [
         correlation(cells, finest.predict(finest.initial, k))
@@ -340,7 +354,7 @@ def _set_photometry(level, sums, settings):
 
 
 def _fit_albedo(level, u, priors, misfits, settings):
-    """Albedo of the cells, given the surface; the exposures keep its mean at 1."""
+    """Albedo of the cells, given the surface; exposures that are free keep its mean at 1."""
     images = range(len(level.views))
     shading = [(level.predict(u, k) - level.hazes[k]) / level.albedo for k in images]
     without_haze = [c - haze for c, haze in zip(level.cells, level.hazes, strict=True)]
@@ -351,7 +365,9 @@ def _fit_albedo(level, u, priors, misfits, settings):
             noise = noise * np.minimum(misfits * (len(level.views) / freedom) ** 0.5, 1.0)
         contrast = max(contrast, observed_contrast(shading, without_haze, noise))
     level.albedo = fit_albedo(shading, without_haze, noise, contrast, level.albedo)
-    _set_photometry(level, level.assemble(u)[2], settings)
+    if settings.estimate_exposure:
+        level.albedo /= np.float32(level.albedo.mean(dtype=float))
+        _set_photometry(level, level.assemble(u)[2], settings)
 
 
 def _estimate_priors(level):

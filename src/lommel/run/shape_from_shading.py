@@ -19,6 +19,7 @@ from lommel.estimate.shape_from_shading import SolverSettings, correlation, solv
 from lommel.estimate.surface import Surface
 from lommel.io.raster import write_raster
 from lommel.run.inputs import GridSettings, SceneFiles
+from lommel.run.photometry import read_known
 from lommel.run.products import RunRecord, output_folder
 from lommel.run.register import settle_cameras
 from lommel.run.views import read_views
@@ -43,6 +44,8 @@ class SfsSettings:
     priors : PriorSettings
     solver : SolverSettings
     masks : MaskSettings
+    albedo, exposures : str or None
+        Map and table of an earlier run, held fixed.
     registers : bool
         Register raw images to the DEM first; otherwise they are only checked.
     """
@@ -52,6 +55,8 @@ class SfsSettings:
     priors: PriorSettings = field(default_factory=PriorSettings)
     solver: SolverSettings = field(default_factory=SolverSettings)
     masks: MaskSettings = field(default_factory=MaskSettings)
+    albedo: str | None = None
+    exposures: str | None = None
     registers: bool = False
 
 
@@ -97,13 +102,24 @@ def run_shape_from_shading(
             record.add_inputs([*files.cameras, *filter(None, tables)])
             record.add_skipped([*lost, *scene.skipped])
             _refuse_small(scene.grid)
+            names = [view.name for view in scene.views]
+            cells = cell_grid(scene.grid)
+            albedo, photometry = read_known(settings.albedo, settings.exposures, cells, names)
+            record.add_inputs([*filter(None, (settings.albedo, settings.exposures))])
         with record.stage("solve"):
             known = np.isfinite(scene.heights)
             initial = fill_holes(scene.heights)
             surface = _surface(scene.grid, initial, scene.views[0], settings.parametrisation)
             start = surface.posts_from_heights(initial)
             solution = solve_surface(
-                surface, start, scene.views, model, settings.priors, settings.solver
+                surface,
+                start,
+                scene.views,
+                model,
+                settings.priors,
+                settings.solver,
+                albedo,
+                photometry,
             )
         with record.stage("write"):
             refined = surface.heights_from_posts(solution.value.u)
