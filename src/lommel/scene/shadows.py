@@ -8,11 +8,13 @@ Most callers want `sunlit`.
 
 import numba
 import numpy as np
+from scipy.ndimage import maximum_filter
 
 from lommel.scene.body import to_xyz
 from lommel.scene.geometry import unit
 from lommel.scene.grid import Window
 
+BLOCK = 16  # posts along each side of the squares whose highest post lets rays leap
 REACH_LIMIT = 3000  # posts; terrain farther away casts no shadow and hides nothing
 
 
@@ -55,6 +57,7 @@ def sunlit(grid, heights, sun_position, window=None):
     )
     return _march(
         heights,
+        _highest_around(heights),
         (window.row, window.col),
         (row_step, col_step),
         distance,
@@ -122,8 +125,19 @@ def _steps(horizontal, to_south, to_east):
     return (ee * s - se * e) / determinant, (ss * e - se * s) / determinant
 
 
+def _highest_around(heights):
+    """Highest terrain in each square of `BLOCK` posts and the eight around it."""
+    rows, cols = (-(-size // BLOCK) for size in heights.shape)
+    padded = np.full((rows * BLOCK, cols * BLOCK), -np.inf, heights.dtype)
+    padded[: heights.shape[0], : heights.shape[1]] = np.where(
+        np.isfinite(heights), heights, -np.inf
+    )
+    squares = padded.reshape(rows, BLOCK, cols, BLOCK).max(axis=(1, 3))
+    return maximum_filter(squares, 3, mode="nearest")
+
+
 @numba.njit(cache=True, parallel=True)
-def _march(heights, first, steps, distance, tangent, highest, radius):
+def _march(heights, around, first, steps, distance, tangent, highest, radius):
     rows, cols = distance.shape
     is_lit = np.ones((rows, cols), np.bool_)
     for index in numba.prange(rows):
@@ -131,6 +145,7 @@ def _march(heights, first, steps, distance, tangent, highest, radius):
         for col in range(cols):
             is_lit[row, col] = _sees_sun(
                 heights,
+                around,
                 first[0] + row,
                 first[1] + col,
                 steps[0][row, col],
@@ -144,7 +159,7 @@ def _march(heights, first, steps, distance, tangent, highest, radius):
 
 
 @numba.njit(cache=True)
-def _sees_sun(heights, row, col, row_step, col_step, distance, tangent, highest, radius):
+def _sees_sun(heights, around, row, col, row_step, col_step, distance, tangent, highest, radius):
     rows, cols = heights.shape
     bend = (1.0 + 2.0 * tangent * tangent) / (2.0 * radius)
     if not distance > 0.0:  # the target stands at the zenith
@@ -158,6 +173,9 @@ def _sees_sun(heights, row, col, row_step, col_step, distance, tangent, highest,
         ray = heights[row, col] + gone * tangent + gone * gone * bend
         if not ray <= highest:  # also where the post itself is NaN
             return True
+        if tangent >= 0.0 and ray > around[int(there_row) // BLOCK, int(there_col) // BLOCK]:
+            count += BLOCK  # the ray rises: nothing up to there reaches it
+            continue
         r0, c0 = min(int(there_row), rows - 2), min(int(there_col), cols - 2)
         r, c = there_row - r0, there_col - c0
         terrain = (1.0 - r) * ((1.0 - c) * heights[r0, c0] + c * heights[r0, c0 + 1]) + r * (
