@@ -90,6 +90,7 @@ def albedo(
     output: Output,
     sun_positions: SunTable = None,
     spacecraft_positions: CraftTable = None,
+    cameras: Cameras = None,
     positions_unit: Unit = "auto",
     solver: Annotated[
         str, typer.Option(help="projection, or alternating: the published iteration.")
@@ -120,7 +121,7 @@ def albedo(
     bounds: Bounds = None,
     overwrite: Overwrite = False,
 ):
-    """Albedo map and exposures from overlapping orthoimages and a DEM."""
+    """Albedo map and exposures from overlapping images, projected or with cameras, and a DEM."""
     from lommel.run.albedo import albedo_settings, run_albedo
 
     settings = albedo_settings(
@@ -133,7 +134,7 @@ def albedo(
         reflectance=reflectance,
         shadow_threshold=shadow_threshold,
     )
-    files = _files(images, dem, sun_positions, spacecraft_positions, positions_unit)
+    files = _files(images, dem, sun_positions, spacecraft_positions, positions_unit, cameras)
     with _progress("Reading images") as progress:
         run_albedo(files, output, settings, _grid(spacing, crs, bounds), overwrite, progress)
     _finish(output)

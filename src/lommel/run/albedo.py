@@ -16,7 +16,8 @@ from lommel.estimate.albedo_quality import (
 )
 from lommel.estimate.albedo_settings import AlbedoSettings, published_settings
 from lommel.io.raster import write_raster
-from lommel.run.inputs import GridSettings, SceneFiles, Skipped, read_scene
+from lommel.run.inputs import GridSettings, SceneFiles, Skipped
+from lommel.run.mixed_scene import read_mixed_scene
 from lommel.run.products import RunRecord, output_folder
 
 SHARED_NAMES = ("phase_c1_per_rad", "phase_c2", "falloff_v2_per_rad2", "falloff_v4_per_rad4")
@@ -55,7 +56,7 @@ def run_albedo(
     overwrite: bool = False,
     progress=iter,
 ):
-    """Estimate albedo and exposures from orthoimages and write the products.
+    """Estimate albedo and exposures from orthoimages or raw images and write the products.
 
     Parameters
     ----------
@@ -79,9 +80,10 @@ def run_albedo(
     )
     with output_folder(output, overwrite) as folder:
         with record.stage("read"):
-            scene = read_scene(files, grid_settings, prefer="images", progress=progress)
-            record.add_inputs([*files.images, *files.dems])
-            record.add_inputs([files.sun_positions, files.spacecraft_positions])
+            scene = read_mixed_scene(files, grid_settings, progress=progress)
+            record.add_inputs([*files.images, *files.dems, *files.cameras])
+            tables = (files.sun_positions, files.spacecraft_positions)
+            record.add_inputs([path for path in tables if path is not None])
         with record.stage("solve"):
             result = estimate_albedo(scene.observations, scene.grid, scene.heights, settings)
         with record.stage("write"):

@@ -120,9 +120,9 @@ def read_scene(files, grid_settings=None, prefer="images", body=MOON, progress=i
     refuse_duplicates(files.images)
     if not files.dems:
         raise InputError("No DEM given. Name at least one with --dem.")
-    tables = _read_tables(files, body)
+    tables = read_position_tables(files, body)
     dem_grids = [read_grid(path, body) for path in files.dems]
-    image_grids, skipped = _place_images(files.images, dem_grids, body)
+    image_grids, skipped = place_images(files.images, dem_grids, body)
     if not image_grids:
         raise InputError("No image can be used.\n" + listing(skipped))
     grid = choose_grid(
@@ -133,7 +133,7 @@ def read_scene(files, grid_settings=None, prefer="images", body=MOON, progress=i
     observations = []
     for path in progress(list(image_grids)):
         try:
-            observations.append(_observe(path, image_grids[path], grid, heights, tables, body))
+            observations.append(observe(path, image_grids[path], grid, heights, tables, body))
         except LommelError as error:
             skipped.append(Skipped(path.name, str(error)))
     if not observations:
@@ -231,7 +231,8 @@ def known_heights(paths, grid, body=MOON):
     return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
 
 
-def _place_images(paths, dem_grids, body):
+def place_images(paths, dem_grids, body):
+    """Grid of each orthoimage that overlaps a DEM, and the `Skipped` others."""
     grids, skipped = {}, []
     for path in paths:
         try:
@@ -244,7 +245,8 @@ def _place_images(paths, dem_grids, body):
     return grids, skipped
 
 
-def _observe(path, image_grid, grid, heights, tables, body):
+def observe(path, image_grid, grid, heights, tables, body):
+    """An orthoimage on the grid of the run, an `Observation`; tables as `read_position_tables`."""
     window = image_grid.footprint(grid)
     if window.is_empty:
         raise GeometryError(f"{path.name} does not overlap the output grid.")
@@ -258,7 +260,8 @@ def _observe(path, image_grid, grid, heights, tables, body):
     return Observation(path.name, window, measured, *positions, info.saturation)
 
 
-def _read_tables(files, body):
+def read_position_tables(files, body):
+    """Path and content of the Sun's and of the spacecraft's table."""
     tables = []
     for kind, path in (("sun", files.sun_positions), ("spacecraft", files.spacecraft_positions)):
         if path is None:
