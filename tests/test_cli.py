@@ -184,6 +184,46 @@ def test_info_prints_facts_or_json(scene, lommel):
     assert "gsd_m                    100.0\n" in lommel("info", "a.tif").out
 
 
+def test_info_shows_the_ground_point_of_a_pixel(raw, lommel):
+    """The camera p stands over 0 E; tables and DEM serve a pixel as they serve an image."""
+    pixel = ("info", "p.tif", "--pixel", "20", "18", "--sun-positions", "sun.txt")
+    ended = lommel(*pixel, "--json")
+    assert ended.status == 0, ended.err
+    facts = json.loads(ended.out)
+    assert {"longitude_deg", "latitude_deg", "height_m", "emission_deg"} <= set(facts)
+    assert {"incidence_deg", "phase_deg"} <= set(facts)
+    assert f"longitude_deg            {facts['longitude_deg']}\n" in lommel(*pixel).out
+    on_dem = json.loads(lommel(*pixel, "--dem", "dem.tif", "--json").out)
+    assert on_dem["height_m"] != 0.0
+    assert on_dem["ellipsoid_emission_deg"] == pytest.approx(facts["emission_deg"], abs=0.1)
+
+
+def test_info_writes_a_camera_that_other_commands_take(raw, lommel):
+    ended = lommel("info", "p.tif", "--write-isd", "p.json", "--json")
+    assert ended.status == 0, ended.err
+    (before,) = json.loads(ended.out)
+    (after,) = json.loads(lommel("info", "p.tif", "--json").out)
+    assert (before.pop("camera_file"), after.pop("camera_file")) == ("p.tsai", "p.json")
+    names = ("longitude_deg", "latitude_deg", "gsd_m", "spacecraft_altitude_m")
+    assert [after[name] for name in names] == [before[name] for name in names]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["p.tif", "q.tif", "--pixel", "1", "1"], "--pixel and --write-isd take one image; 2 are"),
+        (["p.tif", "--dem", "dem.tif"], "--dem tells where --pixel looks; give --pixel SAMPLE"),
+        (["p.tif", "--pixel", "1", "1e9"], "sample 1, line 1e+09 lies outside the image of"),
+        (["p.tif", "--cameras", "q.tsai", "--cameras", "p.tsai"], "--cameras names 2 files for 1"),
+        (["dem.tif", "--write-isd", "d.json"], "dem.tif: no camera found. Looked for an ISD"),
+    ],
+)
+def test_info_that_cannot_be_given_is_an_error(raw, lommel, words, message):
+    ended = lommel("info", *words)
+    assert (ended.status, ended.out) == (2, "")
+    assert message in ended.err
+
+
 # --- Wrong words ----------------------------------------------------------------------------------
 
 

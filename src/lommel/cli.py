@@ -366,8 +366,6 @@ def info(
     if dem is not None and pixel is None:
         raise InputError("--dem tells where --pixel looks; give --pixel SAMPLE LINE too.")
     named = named_cameras(files, cameras, kernels)
-    if write_isd is not None:
-        write_camera(write_isd, files[0], named[0])
     if pixel is not None:
         facts = [describe_pixel(files[0], *pixel, dem, named[0], sun_positions)]
     else:
@@ -375,6 +373,8 @@ def info(
             describe(path, sun_positions, spacecraft_positions, camera)
             for path, camera in zip(files, named, strict=True)
         ]
+    if write_isd is not None:
+        write_camera(write_isd, files[0], named[0])
     if as_json:
         typer.echo(json.dumps(facts if pixel is None else facts[0], indent=1))
         return

@@ -132,6 +132,8 @@ def _terrain(grid, heights, row, col):
 def _crossed_part(grid, origin, direction, body):
     """The posts between which a ray can meet the terrain, or None."""
     ends = np.stack([meet_sphere(origin, direction, body.radius + rise) for rise in RELIEF])
+    if np.linalg.norm(origin) < body.radius + RELIEF[1]:
+        ends[1] = origin
     if np.isfinite(ends).all():
         row, col = grid.index_at(*to_lonlat(body, ends)[:2])
         if not np.isfinite([row, col]).all():

@@ -1,7 +1,7 @@
 """What `lommel albedo` reads: orthoimages, and raw images brought onto the DEM on the way.
 
-An image with a camera (named, in a file beside it, or in its ISIS label) is raw. Most callers want
-`read_mixed_scene`.
+An image is raw when a camera is named for it, or when it has no CRS and its camera is in a file
+beside it or in its ISIS label. Most callers want `read_mixed_scene`.
 """
 
 from dataclasses import replace
@@ -90,7 +90,15 @@ def _cameras(files):
             f"--cameras names {len(files.cameras)} files for {len(files.images)} images. "
             "Name one per image, in the same order."
         )
-    return list(files.cameras) or [find_camera(path) for path in files.images]
+    return list(files.cameras) or [_own_camera(path) for path in files.images]
+
+
+def _own_camera(path):
+    """Camera beside an image or in it; None when the image lies on a map."""
+    try:
+        return None if raster_info(path).grid is not None else find_camera(path)
+    except LommelError:
+        return None  # reported when the image is read
 
 
 def _place_raw(images, terrain, settings):
