@@ -37,7 +37,7 @@ def find_camera(image):
         return None  # reported when the image is read
 
 
-def read_camera(path, shape):
+def read_camera(path, shape, kernels=None):
     """The camera in a file.
 
     Parameters
@@ -45,13 +45,26 @@ def read_camera(path, shape):
     path : Path
     shape : tuple of int
         Lines and samples of the image.
+    kernels : path, optional
+        SPICE meta-kernel, which together with the label of an ISIS cube makes the camera.
 
     Returns
     -------
     camera : Camera
     """
     path = Path(path)
+    try:
+        return _read(path, shape, kernels)
+    except InputError as error:
+        if str(path) in str(error):
+            raise
+        raise InputError(f"{path}: {error}") from error  # what the models refuse
+
+
+def _read(path, shape, kernels):
     reader = READERS.get(path.suffix.lower())
+    if kernels is not None:
+        return read_isis(path, shape, kernels)
     if reader is not None:
         return reader(path, shape)
     try:

@@ -20,6 +20,7 @@ from lommel.io.inertial import KM, from_quaternions, positions, rotations
 
 BYTES_LIMIT = 256 * 2**20  # a NAC image of 52 224 lines with an entry per line has 3 MB
 TYPES = {"double": "f8", "real": "f4", "integer": "i4", "text": "S"}
+TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # classic and BigTIFF
 ORDERS = {"lsb": "<", "msb": ">"}
 SAMPLES = 1001  # times at which polynomials of a whole image are tabulated
 DEGREE_LIMIT = 20
@@ -142,8 +143,13 @@ def _bytes(path, keywords, size, title):
         place = f"from byte {start + 1}"
         try:
             with open(path, "rb") as file:
-                file.seek(0, 2)
                 data = b""
+                if file.read(4) in TIFF_STARTS:
+                    raise InputError(
+                        f"{title} is described in the label, but was left behind in the cube: a "
+                        "GDAL older than 3.12 made the GeoTIFF. Make it again, or give the cube."
+                    )
+                file.seek(0, 2)
                 if 0 <= start <= file.tell() - size:
                     file.seek(start)
                     data = file.read(size)
@@ -152,8 +158,7 @@ def _bytes(path, keywords, size, title):
     if len(data) < size:
         raise InputError(
             f"{title} claims {size} bytes {place}, but they are not all there. The file is "
-            "truncated, its tables are in a file of their own, or it was translated by a GDAL "
-            "older than 3.12, which leaves tables behind."
+            "truncated, or its tables are in files of their own."
         )
     return data
 

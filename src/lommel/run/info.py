@@ -8,7 +8,6 @@ import numpy as np
 from lommel.errors import InputError
 from lommel.io.cameras import find_camera, read_camera
 from lommel.io.isd import write_isd
-from lommel.io.isis import read_isis
 from lommel.io.positions import find_position, read_positions
 from lommel.io.raster import raster_info
 from lommel.run.camera_facts import camera_facts
@@ -38,7 +37,7 @@ def named_cameras(files, cameras=None, kernels=None):
     if cameras and kernels:
         raise InputError("--cameras and --kernels both give cameras. Use one of them.")
     if kernels:
-        return [read_isis(path, raster_info(path).shape, kernels) for path in files]
+        return [read_camera(path, raster_info(path).shape, kernels) for path in files]
     if cameras and len(cameras) != len(files):
         raise InputError(
             f"--cameras names {len(cameras)} files for {len(files)} images. Name one per image, "
