@@ -149,7 +149,8 @@ def settle_cameras(files, folder, registers=False):
     cameras = files.cameras or tuple(find_camera(path) for path in files.images)
     known = {p: c for p, c in zip(files.images, cameras, strict=False) if c is not None}
     if not known or not files.dems or len(cameras) != len(files.images):
-        return files, [], ""
+        remark = " Orthoimages are not registered: give the raw images." if registers else ""
+        return files, [], remark
     raw = replace(files, images=tuple(known), cameras=tuple(known.values()))
     images, _ = read_raw_images(raw)  # what cannot be read is reported by the stage itself
     images = [image for image in images if image.sun is not None]
