@@ -4,7 +4,6 @@
 the raw images of other stages.
 """
 
-import csv
 from contextlib import suppress
 from dataclasses import asdict, replace
 
@@ -17,35 +16,16 @@ from lommel.run.inputs import SceneFiles, Skipped, listing
 from lommel.run.products import RunRecord, output_folder
 from lommel.run.raw_images import Terrain, read_raw_images
 from lommel.run.register_to_terrain import (
-    MOST_CHANCE,
     RegistrationSettings,
     place_whole,
     register_to_terrain,
 )
+from lommel.run.registration_table import camera_name, quality, why_lost, write_table
 from lommel.run.tie_images import placed, tie_images
 from lommel.scene.camera import FrameCamera
 
 CHECK_POSTS = 2**16  # of the map on which an image is checked
 VISIBLE = 3.0  # standard errors of the shift, and px, from which an image is visibly off
-COLUMNS = (
-    "image",
-    "used",
-    "quality",
-    "shift_line_px",
-    "shift_sample_px",
-    "shift_m",
-    "error_m",
-    "residual_px",
-    "patches",
-    "patches_agreeing",
-    "correlation",
-    "likelihood",
-    "likelihood_elsewhere",
-    "tie_patches",
-    "tie_residual_px",
-    "camera",
-    "reason",
-)
 
 
 def run_register(
@@ -89,8 +69,8 @@ def run_register(
         with record.stage("write"):
             used = [states[number] for number in sorted(known)]
             for state in used:
-                write_isd(folder / _camera_name(state), with_sun(state.corrected))
-            _write_table(folder / "register.csv", used, lost, skipped)
+                write_isd(folder / camera_name(state), with_sun(state.corrected))
+            write_table(folder / "register.csv", used, lost, skipped)
         record.add_skipped(skipped)
         record.results = _results(used)
         record.outcome = {"name": "done", "sentence": _sentence(used)}
@@ -162,7 +142,7 @@ def settle_cameras(files, folder, registers=False):
     lost = []
     for number, state in enumerate(states):
         if number in found:
-            known[state.image.path] = folder / _camera_name(state)
+            known[state.image.path] = folder / camera_name(state)
             write_isd(known[state.image.path], with_sun(state.corrected))
         else:
             lost.append(Skipped(state.image.name, why_lost(state, settings)))
@@ -220,92 +200,6 @@ def with_sun(image):
     if camera.sun_position is None and isinstance(camera, FrameCamera):
         return replace(camera, sun_position=image.sun_position)
     return camera
-
-
-def quality(state):
-    """How well an image's place is known, in a word.
-
-    Parameters
-    ----------
-    state : Registration
-
-    Returns
-    -------
-    quality : str
-        ``patches``: parts of the image agree on it; ``whole``: the image as a whole has one
-        distinct place; ``ties``: only other images tell.
-    """
-    if not state.is_on_terrain:
-        return "ties"
-    return "patches" if state.chance < MOST_CHANCE else "whole"
-
-
-def why_lost(state, settings):
-    """Why an image's place was not found, and what to do."""
-    if state.whole is None:
-        return (
-            f"{state.image.name}: image and DEM share too little, or the DEM's posts are too far "
-            "apart for it. Give a DEM that covers the image, with finer posts."
-        )
-    whole = state.whole
-    found = f"{whole.likelihood:.0f} against {max(whole.runner_up, 0.0):.0f}"
-    if not whole.is_inside:
-        found += ", at the rim of the search"
-    return (
-        f"{state.image.name}: no place on the terrain stands out (log-likelihood of the best, "
-        f"{found} elsewhere). It may lie farther off than --search-radius "
-        f"{settings.search_radius:g} m, be lit from too high, or the DEM may be too coarse."
-    )
-
-
-def _camera_name(state):
-    return f"{state.image.path.stem}.json"
-
-
-def _write_table(path, used, lost, skipped):
-    reasons = {skip.name: skip.reason for skip in skipped}
-    with open(path, "w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n", restval="")
-        writer.writeheader()
-        for state in used:
-            writer.writerow(_row(state) | {"used": 1, "camera": _camera_name(state)})
-        for state in lost:
-            reason = reasons.pop(state.image.name)
-            writer.writerow(_match_row(state) | {"used": 0, "reason": reason})
-        for name, reason in reasons.items():
-            writer.writerow({"image": name, "used": 0, "reason": reason})
-
-
-def _row(state):
-    line, sample = state.shift
-    gsd = state.site.gsd
-    return _match_row(state) | {
-        "quality": quality(state),
-        "shift_line_px": _number(line),
-        "shift_sample_px": _number(sample),
-        "shift_m": _number(np.hypot(line, sample) * gsd),
-        "error_m": _number(state.error),
-        "residual_px": _number(state.residual / gsd),
-        "patches": state.patches,
-        "patches_agreeing": state.agreeing,
-        "tie_patches": state.ties,
-        "tie_residual_px": _number(state.tie_residual / gsd),
-    }
-
-
-def _match_row(state):
-    row = {"image": state.image.name}
-    if state.whole is not None:
-        row |= {
-            "correlation": _number(state.whole.correlation),
-            "likelihood": _number(state.whole.likelihood),
-            "likelihood_elsewhere": _number(state.whole.runner_up),
-        }
-    return row
-
-
-def _number(value):
-    return f"{float(value):.5g}" if np.isfinite(value) else ""
 
 
 def _results(used):
