@@ -70,6 +70,9 @@ Reflectance = Annotated[
         "or module:function."
     ),
 ]
+Registers = Annotated[
+    bool, typer.Option("--register", help="Register raw images to the DEM first.")
+]
 BY_SOLVER = "Default: as published with --solver alternating, else "
 OwnReflectance = Annotated[
     str | None,
@@ -114,6 +117,7 @@ def albedo(
     fit_falloff: Annotated[
         bool | None, typer.Option(help=f"Estimate the lens's darker corners. {BY_SOLVER}yes.")
     ] = None,
+    registers: Registers = False,
     reflectance: OwnReflectance = None,
     shadow_threshold: ShadowThreshold = None,
     spacing: Spacing = None,
@@ -136,7 +140,9 @@ def albedo(
     )
     files = _files(images, dem, sun_positions, spacecraft_positions, positions_unit, cameras)
     with _progress("Reading images") as progress:
-        run_albedo(files, output, settings, _grid(spacing, crs, bounds), overwrite, progress)
+        run_albedo(
+            files, output, settings, _grid(spacing, crs, bounds), overwrite, progress, registers
+        )
     _finish(output)
 
 
@@ -187,9 +193,7 @@ def sfs(
         Path | None, typer.Option(help="Known exposures, as exposures.csv of a run; held fixed.")
     ] = None,
     max_steps: Annotated[int, typer.Option(min=1, help="Gauss-Newton steps on the full grid.")] = 8,
-    registers: Annotated[
-        bool, typer.Option("--register", help="Register raw images to the DEM first.")
-    ] = False,
+    registers: Registers = False,
     reflectance: Reflectance = "lunar-lambert",
     shadow_threshold: ShadowThreshold = None,
     spacing: Spacing = None,

@@ -7,6 +7,7 @@ import pytest
 from lommel.errors import GeometryError, InputError
 from lommel.io.cameras import read_camera
 from lommel.io.isd import write_isd
+from lommel.run.albedo import run_albedo
 from lommel.run.inputs import SceneFiles
 from lommel.run.register import run_register, settle_cameras
 from lommel.run.register_to_terrain import RegistrationSettings, register_to_terrain
@@ -119,3 +120,18 @@ def test_an_image_that_is_off_is_warned_of_and_registered_on_demand(scene, tmp_p
 def test_settings_out_of_range_are_refused(options, message):
     with pytest.raises(InputError, match=message):
         RegistrationSettings(**options)
+
+
+def test_albedo_takes_registered_cameras(scene, tmp_path):
+    """Two frames, each off in its own direction, disagree less once they are registered."""
+    paths = tuple(
+        frame(scene, tmp_path, name, offset, direction)
+        for name, offset, direction in (("a", 900.0, 1.0), ("b", 900.0, 4.0))
+    )
+    cameras = tuple(path.with_suffix(".json") for path in paths)
+    files = SceneFiles(paths, (scene.dem,), cameras=cameras)
+    off = run_albedo(files, tmp_path / "off")
+    on = run_albedo(files, tmp_path / "on", registers=True)
+    assert on["disagreement_after_percent"] < 0.5 * off["disagreement_after_percent"]
+    record = json.loads((tmp_path / "off" / "run.json").read_text())
+    assert "images do not lie on the DEM" in record["outcome"]["sentence"]

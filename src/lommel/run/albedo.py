@@ -17,8 +17,9 @@ from lommel.estimate.albedo_quality import (
 from lommel.estimate.albedo_settings import AlbedoSettings, published_settings
 from lommel.io.raster import write_raster
 from lommel.run.inputs import GridSettings, SceneFiles, Skipped
-from lommel.run.mixed_scene import read_mixed_scene
+from lommel.run.mixed_scene import raw_cameras, read_mixed_scene
 from lommel.run.products import RunRecord, output_folder
+from lommel.run.register import settle_cameras
 
 SHARED_NAMES = ("phase_c1_per_rad", "phase_c2", "falloff_v2_per_rad2", "falloff_v4_per_rad4")
 
@@ -55,6 +56,7 @@ def run_albedo(
     grid_settings: GridSettings | None = None,
     overwrite: bool = False,
     progress=iter,
+    registers: bool = False,
 ):
     """Estimate albedo and exposures from orthoimages or raw images and write the products.
 
@@ -68,6 +70,8 @@ def run_albedo(
     overwrite : bool
     progress : callable
         Wraps the iterable of images.
+    registers : bool
+        Register raw images to the DEM first; otherwise they are only checked.
 
     Returns
     -------
@@ -76,11 +80,14 @@ def run_albedo(
     """
     settings = settings or AlbedoSettings()
     record = RunRecord(
-        "albedo", asdict(settings) | {"grid": asdict(grid_settings or GridSettings())}
+        "albedo",
+        asdict(settings)
+        | {"grid": asdict(grid_settings or GridSettings()), "registers": registers},
     )
     with output_folder(output, overwrite) as folder:
         with record.stage("read"):
-            scene = read_mixed_scene(files, grid_settings, progress=progress)
+            settled, lost, remark = settle_cameras(files, folder, registers, raw_cameras(files))
+            scene = read_mixed_scene(settled, grid_settings, progress=progress)
             record.add_inputs([*files.images, *files.dems, *files.cameras])
             tables = (files.sun_positions, files.spacecraft_positions)
             record.add_inputs([path for path in tables if path is not None])
@@ -90,12 +97,13 @@ def run_albedo(
             names = [observation.name for observation in scene.observations]
             reasons = zip(names, result.reasons, strict=True)
             unused = [Skipped(name, f"{name}: {reason}") for name, reason in reasons if reason]
-            record.add_skipped([*scene.skipped, *unused])
+            skipped = [*lost, *scene.skipped]
+            record.add_skipped([*skipped, *unused])
             _write_rasters(folder, scene.grid, result)
-            _write_exposures(folder / "exposures.csv", names, result, scene.skipped)
+            _write_exposures(folder / "exposures.csv", names, result, skipped)
         record.results = _results(scene, result)
         record.history = result.history
-        record.outcome = {"name": result.outcome, "sentence": result.advice}
+        record.outcome = {"name": result.outcome, "sentence": result.advice + remark}
         record.write(folder)
     return record.results
 

@@ -48,7 +48,7 @@ def read_mixed_scene(files, grid_settings=None, body=MOON, progress=iter):
         The spacecraft of a line-scan image stands where it was at the middle line.
     """
     refuse_duplicates(files.images)
-    cameras = _cameras(files)
+    cameras = raw_cameras(files)
     if not any(cameras):
         return read_scene(files, grid_settings, "images", body, progress)
     settings = grid_settings or GridSettings()
@@ -83,7 +83,7 @@ def read_mixed_scene(files, grid_settings=None, body=MOON, progress=iter):
     return Scene(grid, heights, [found[path] for path in files.images if path in found], skipped)
 
 
-def _cameras(files):
+def raw_cameras(files):
     """Camera file of each image, None for an orthoimage."""
     if files.cameras and len(files.cameras) != len(files.images):
         raise InputError(

@@ -106,7 +106,7 @@ def register_images(images, terrain, settings, progress=iter):
     return states, failed
 
 
-def settle_cameras(files, folder, registers=False):
+def settle_cameras(files, folder, registers=False, cameras=None):
     """Cameras of raw images, registered or only checked, before another stage uses them.
 
     Parameters
@@ -117,6 +117,8 @@ def settle_cameras(files, folder, registers=False):
         Where registered cameras are written.
     registers : bool
         Without it, images that are visibly off are only named.
+    cameras : sequence of path or None, optional
+        Camera of each image, None for an orthoimage; by default those named or found.
 
     Returns
     -------
@@ -126,7 +128,7 @@ def settle_cameras(files, folder, registers=False):
     remark : str
         A sentence on what was found; empty when all is well.
     """
-    cameras = files.cameras or tuple(find_camera(path) for path in files.images)
+    cameras = cameras or files.cameras or [find_camera(path) for path in files.images]
     known = {p: c for p, c in zip(files.images, cameras, strict=False) if c is not None}
     if not known or not files.dems or len(cameras) != len(files.images):
         remark = " Orthoimages are not registered: give the raw images." if registers else ""
