@@ -182,7 +182,13 @@ def sfs(
     estimate_exposure: Annotated[
         bool, typer.Option(help="Re-estimate the exposures with the surface.")
     ] = True,
-    estimate_haze: Annotated[bool, typer.Option(help="Also estimate an offset per image.")] = False,
+    estimate_haze: Annotated[
+        bool | None,
+        typer.Option(
+            help="Also estimate an offset per image. Default: where the DEM is interpolated between "
+            "measured posts, as altimetry is."
+        ),
+    ] = None,
     estimate_albedo: Annotated[
         bool, typer.Option(help="Give albedo what shading cannot explain; otherwise it is 1.")
     ] = True,

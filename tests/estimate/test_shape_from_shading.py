@@ -11,6 +11,7 @@ from lommel.core.multigrid import NormalEquations, conjugate_gradients
 from lommel.core.normal_operator import slope_adjoint
 from lommel.core.reflectance import reflectance_model
 from lommel.estimate.holes import fill_holes
+from lommel.estimate.measured_posts import measured_posts
 from lommel.estimate.priors import Priors
 from lommel.estimate.shape_from_shading import SolverSettings, solve_surface
 from lommel.estimate.surface import Surface
@@ -19,6 +20,7 @@ from lommel.scene.grid import Grid
 from lommel.scene.view import OrthoView
 
 from .shading_scene import EXPOSURE, blank_view, exact_problem, hills, patch_grid
+from .test_measured_posts import triangulated
 
 NOISE = 0.2  # image units, 0.3 % of the brightness
 HEIGHT_SHARE = 0.4  # of the initial error may be left; measured 0.35 on this rough, small patch
@@ -303,3 +305,18 @@ def test_known_albedo_and_exposures_are_held_and_used():
     assert told.exposures[0] == EXPOSURE and told.hazes[0] == 0.0
     assert np.array_equal(told.albedo, albedo)
     assert rms(told.u - truth) < 0.8 * rms(alone.u - truth)
+
+
+def test_gaps_between_altimeter_tracks_are_filled_from_one_image():
+    """Tracks 30 posts apart, linear interpolation between them, light across the tracks."""
+    truth, _ = rough_scene()
+    grid = patch_grid(*truth.shape)
+    dem, _ = triangulated(truth, range(2, truth.shape[1], 30))
+    dem = np.where(np.isfinite(dem), dem, truth.mean()).astype(np.float32)
+    view = simulated_views(truth, grid, (95.0,))[0]
+    measured = measured_posts(dem)
+    start = fill_holes(np.where(measured, dem, np.nan).astype(np.float32))
+    solution = solve_surface(
+        Surface(grid, 0.0), start, [view], reflectance_model(), measured=measured
+    )
+    assert rms(solution.value.u - truth) < 0.35 * rms(dem - truth)

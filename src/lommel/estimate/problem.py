@@ -84,6 +84,8 @@ class Problem:
     slope: np.ndarray
     expected: np.ndarray
     albedo_error: float = 0.0
+    pins: np.ndarray | None = None
+    pinned: np.ndarray | None = None
     shadows: list = field(default_factory=list)
     geometry: list = field(default_factory=list)
     memory: dict = field(default_factory=dict)
@@ -214,6 +216,24 @@ class Problem:
         self.expected = smoothed(self.initial, priors.smoothing)
         self.albedo_error = priors.albedo_error
 
+    def pin(self, measured, error):
+        """Hold single posts of the initial surface, and expect nothing of the others.
+
+        Between them the surface is only as rough as terrain is; albedo is no noise here, because
+        it is estimated along.
+
+        Parameters
+        ----------
+        measured : bool array (rows, cols)
+        error : float, m
+            Standard error of a measured post.
+        """
+        self.pins = measured.astype(np.float32) / np.float32(error**2)
+        self.pinned = self.initial
+        self.expected = np.full_like(self.initial, self.initial.mean(dtype=float))
+        self.masses = np.zeros(1)
+        self.slope = np.zeros(2, np.float32)
+
     def prior_gradient(self, u):
         """Gradient of the prior terms at ``u``, and their cost."""
         cols = u.shape[1]
@@ -228,6 +248,11 @@ class Problem:
             )
         cost = dot(change, out) / 2
         cost += add_long_waves(change, self.masses, out) / 2
+        if self.pins is not None:
+            np.subtract(u, self.pinned, out=change)
+            pull = self.pins * change
+            out += pull
+            cost += dot(change, pull) / 2
         return out, cost
 
     def sample_images(self, u):
@@ -272,6 +297,8 @@ class Problem:
             curvature=self.curvature / 4,
             masses=coarse_masses(self.masses, 1),
         )
+        if self.pins is not None:
+            coarse.pins, coarse.pinned = coarse_pins(self.pins, self.pinned)
         coarse.prepare_geometry(coarse.initial)
         return coarse
 
@@ -379,6 +406,15 @@ def coarse_posts(posts):
     restrict(np.ascontiguousarray(posts), total)
     restrict(np.ones_like(posts), weight)
     return total / weight
+
+
+def coarse_pins(pins, pinned):
+    """Weights of single posts and the values they hold, gathered on every second post."""
+    weight = np.empty(coarse_shape(pins.shape), np.float32)
+    total = np.empty_like(weight)
+    restrict(pins, weight)
+    restrict(pins * pinned, total)
+    return weight, total / np.where(weight > 0, weight, 1)
 
 
 def smoothed(posts, sigma):

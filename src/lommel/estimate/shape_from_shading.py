@@ -34,10 +34,16 @@ from lommel.estimate.shading_kernels import SUM_COUNT, SUM_RR
 COARSEST = 24  # posts along the shorter side of the coarsest level that sees the images
 COARSE_STEPS = 4  # Gauss-Newton steps per coarse level at most; 2 on the largest of them
 ENOUGH_CELLS = 100_000  # of them tell a correlation to (1 - r^2) 0.3 %
-SHORTEST_STEP = 0.1  # of a Gauss-Newton step: the cost that still rises has no way down
+ATTEMPTS = 6  # per step, each damped more: a cost that still rises has no way down
+LEAST_DAMPING, DAMPING_FACTOR = 0.1, 5.0  # first try, and factor to the next
 EXPOSURE_GAIN = 1e-4  # relative, of the cost: exposures that gain less wait for the next step
 ROUNDING = 1e-5  # relative, of a cost summed from float32 residuals
 EXPLAINED = 0.5  # noise standard errors, rms: a surface that leaves less leaves nothing to albedo
+# Where interpolation hides how far a DEM errs, albedo cannot be read off the images beforehand:
+# units that differ by a tenth or two border on each other over some ten posts
+PATCHY = 0.01
+ALBEDO_ROUNDS = 10  # of albedo and surface in turn, at most
+SETTLED = 0.1  # of the change in all rounds: one that changes less ends them
 CELL_UNKNOWNS = 3  # two slopes and the albedo: what a cell's values determine
 POOR_FIT = 2.5  # noise standard errors, rms: more is not noise
 POOR_START = 0.25  # of the brightness taken for noise: the initial DEM explains nothing
@@ -62,8 +68,9 @@ class SolverSettings:
         V-cycles per Gauss-Newton step.
     estimate_exposure : bool
         Re-estimate the exposures after each step.
-    estimate_haze : bool
-        And an offset per image, expected to be small.
+    estimate_haze : bool or None
+        And an offset per image, expected to be small. None: where single measured posts hold the
+        surface, which a DEM that is merely blurred does not do.
     estimate_albedo : bool
         Give albedo what the images show beyond shading; otherwise it stays 1, or as given.
     """
@@ -74,7 +81,7 @@ class SolverSettings:
     cycle_tolerance: float = 0.2
     max_cycles: int = 40
     estimate_exposure: bool = True
-    estimate_haze: bool = False
+    estimate_haze: bool | None = None
     estimate_albedo: bool = True
 
 
@@ -116,7 +123,15 @@ class SurfaceSolution:
 
 
 def solve_surface(
-    surface, initial, views, model, priors=None, settings=None, albedo=None, photometry=None
+    surface,
+    initial,
+    views,
+    model,
+    priors=None,
+    settings=None,
+    albedo=None,
+    photometry=None,
+    measured=None,
 ):
     """Refine a surface by the shading in images.
 
@@ -134,6 +149,8 @@ def solve_surface(
         Known albedo on the cells, held fixed.
     photometry : (array (images,), array (images,)), image units, optional
         Known exposures and hazes, held fixed.
+    measured : bool array (rows, cols), optional
+        Posts that were measured, the others being interpolated; all of them by default.
 
     Returns
     -------
@@ -161,12 +178,20 @@ def solve_surface(
     if not settings.estimate_albedo:
         priors = replace(priors, albedo_error=0.0)
     finest.expect(priors)
+    if measured is not None:
+        spacing = (surface.grid.spacing[0] * surface.grid.spacing[1]) ** 0.5
+        priors = replace(priors, albedo_contrast=max(priors.albedo_contrast, PATCHY))
+        finest.pin(measured, priors.roughness * spacing)
+        if settings.estimate_haze is None:
+            settings = replace(settings, estimate_haze=settings.estimate_exposure)
     correlations = [
         correlation(cells, finest.predict(finest.initial, k))
         for k, cells in enumerate(finest.cells)
     ]
     history: list[dict] = []
     u, converged = _coarse_to_fine(finest, settings, history)
+    if measured is not None and settings.estimate_albedo:
+        u, converged = _part_albedo(finest, u, priors, settings, history)
     sums = finest.assemble(u)[2]
     misfits = np.sqrt(sums[:, SUM_RR] / np.maximum(sums[:, SUM_COUNT], 1))
     if settings.estimate_albedo and misfits.max() > EXPLAINED:
@@ -244,58 +269,92 @@ def _coarse_to_fine(finest, settings, history):
             level.sample_images(u)
             level.find_shadows(u)
         steps = settings.max_steps if level is finest else min(COARSE_STEPS, level.stride)
+        if level.pins is not None:  # the start is smooth: all relief is still to be found
+            steps = settings.max_steps
         u, converged = _descend(level, u, steps, settings, history)
     return u, converged
 
 
 def _descend(level, u, steps, settings, history):
-    """Gauss-Newton steps on one level, shortened where the cost would rise."""
-    here, last_gain, equations = level.expand(u), 0.0, None
+    """Gauss-Newton steps on one level, damped (Levenberg) where the cost would rise."""
+    here, last_gain, damping, equations = level.expand(u), 0.0, 0.0, None
     for _ in range(steps):
-        if equations is None:
-            equations = NormalEquations(here.tensors, level.curvature, level.masses)
-        else:
-            equations.renew(here.tensors)
-        linear = conjugate_gradients(
-            equations,
-            np.negative(here.gradient, out=here.gradient),
-            settings.cycle_tolerance,
-            settings.max_cycles,
-        )
-        gain = dot(here.gradient, linear.x) / 2
-        direction = without_tilt(linear.x) if settings.estimate_exposure else linear.x
-        length, last = 1.0, _best_cost(here, level, settings)
-        u, start = u + direction, u
-        here = _look(level, u)
-        while not _best_cost(here, level, settings) <= last and length > SHORTEST_STEP:
-            length /= 2
-            u = start + np.float32(length) * direction
+        last, start = _best_cost(here, level, settings), u
+        for _ in range(ATTEMPTS):
+            stiffen(here.tensors, damping)
+            if equations is None:
+                equations = NormalEquations(here.tensors, level.curvature, level.masses, level.pins)
+            else:
+                equations.renew(here.tensors)
+            linear = conjugate_gradients(
+                equations,
+                np.negative(here.gradient, out=here.gradient),
+                settings.cycle_tolerance,
+                settings.max_cycles,
+            )
+            gain = dot(here.gradient, linear.x) / 2
+            step = without_tilt(linear.x) if settings.estimate_exposure else linear.x
+            u = start + step
             here = _look(level, u)
-        cost = _best_cost(here, level, settings)
-        if not cost <= last * (1 + ROUNDING):  # no way down: stay
-            _look(level, start)
-            return start, _is_small(np.float32(length) * direction, start, level, settings)
+            cost = _best_cost(here, level, settings)
+            if cost <= last * (1 + ROUNDING):
+                break
+            damping = max(DAMPING_FACTOR * damping, LEAST_DAMPING)
+            u, here = start, _look(level, start)
+        else:  # no way down: stay
+            return start, _is_small(step, start, level, settings)
         level.albedo = here.albedo
         if settings.estimate_exposure and _exposures_are_off(here, level):
             _set_photometry(level, here.sums, settings)
             here = level.expand(u)
-        step = _rms(u - start)
         history.append(
             {
                 "stride": level.stride,
                 "cost": cost,
-                "step_m": step,
+                "step_m": _rms(u - start),
                 "cycles": linear.iterations,
                 "reduction": linear.reduction,
-                "length": length,
+                "damping": damping,
             }
         )
         # gains fall by a constant factor or faster, so the next one can be told
         next_gain, last_gain = gain * (min(gain / last_gain, 1.0) if last_gain else 1.0), gain
         is_done = next_gain < settings.gain_tolerance * abs(cost)
-        if is_done or _is_small(u - start, u, level, settings):
+        if damping == 0 and (is_done or _is_small(u - start, u, level, settings)):
             return u, True
+        damping = damping / DAMPING_FACTOR if damping > LEAST_DAMPING else 0.0
     return u, False
+
+
+def stiffen(tensors, damping):
+    """Resist changes of slope with a share ``damping`` of the images' mean resistance.
+
+    Parameters
+    ----------
+    tensors : float32 array (3, rows - 1, cols - 1)
+        Changed in place.
+    damping : float, dimensionless
+    """
+    if damping > 0:
+        mean = (tensors[0].mean(dtype=float) + tensors[2].mean(dtype=float)) / 2
+        tensors[0] += np.float32(damping * mean)
+        tensors[2] += np.float32(damping * mean)
+
+
+def _part_albedo(level, u, priors, settings, history):
+    """Albedo and surface in turn, until they leave each other alone.
+
+    Measured posts fix the mean slopes between them. What an image shows beyond these on long waves
+    is albedo; taken out of the image, it no longer bends the surface.
+    """
+    converged, before = False, u
+    for _ in range(ALBEDO_ROUNDS):
+        _fit_albedo(level, u, priors, np.ones(len(level.views)), settings)
+        last = u
+        u, converged = _descend(level, u, settings.max_steps, settings, history)
+        if _rms(u - last) < SETTLED * _rms(u - before):
+            break
+    return u, converged
 
 
 def _exposures_are_off(here, level):

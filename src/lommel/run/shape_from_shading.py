@@ -13,6 +13,7 @@ from affine import Affine
 from lommel.core.reflectance import reflectance_model
 from lommel.errors import InputError
 from lommel.estimate.holes import fill_holes
+from lommel.estimate.measured_posts import measured_posts
 from lommel.estimate.priors import PriorSettings
 from lommel.estimate.problem import cos_incidence
 from lommel.estimate.shape_from_shading import SolverSettings, correlation, solve_surface
@@ -28,6 +29,7 @@ from lommel.scene.masks import MaskSettings
 
 PARAMETRISATIONS = ("height", "ray")
 WRITERS = 2  # rasters written at a time: each needs twice its size in memory
+FADING = 10.0  # posts beyond the images' edge over which their say fades
 LEAST_POSTS = 33  # rows and columns: three octaves of wavelengths
 
 
@@ -108,7 +110,10 @@ def run_shape_from_shading(
             record.add_inputs([*filter(None, (settings.albedo, settings.exposures))])
         with record.stage("solve"):
             known = np.isfinite(scene.heights)
-            initial = fill_holes(scene.heights)
+            measured = measured_posts(scene.heights)
+            initial = fill_holes(
+                scene.heights if measured is None else np.where(measured, scene.heights, np.nan)
+            )
             surface = _surface(scene.grid, initial, scene.views[0], settings.parametrisation)
             start = surface.posts_from_heights(initial)
             solution = solve_surface(
@@ -120,10 +125,13 @@ def run_shape_from_shading(
                 settings.solver,
                 albedo,
                 photometry,
+                measured,
             )
         with record.stage("write"):
             refined = surface.heights_from_posts(solution.value.u)
             seen = _seen_posts(solution.value.measured)
+            if measured is not None:
+                refined = faded(refined, scene.heights, seen)
             refined[~(known | seen)] = np.nan
             _write_products(folder, scene, initial, refined, solution.value)
             _write_exposures(folder, scene.views, record.skipped, solution.value)
@@ -153,6 +161,25 @@ def _seen_posts(images):
     seen = np.any([np.isfinite(image) for image in images], axis=0)
     padded = np.pad(seen, 1, mode="edge")
     return padded[1:, 1:] & padded[1:, :-1] & padded[:-1, 1:] & padded[:-1, :-1]
+
+
+def faded(refined, initial, seen):
+    """Refined heights that go over into the initial ones where no image sees the ground.
+
+    Parameters
+    ----------
+    refined, initial : float32 array (rows, cols), m
+        ``initial`` is NaN in holes.
+    seen : bool array (rows, cols)
+
+    Returns
+    -------
+    heights : float32 array (rows, cols), m
+    """
+    from scipy.ndimage import distance_transform_edt  # slow to import, and rarely needed
+
+    share = np.exp(-distance_transform_edt(~seen) / FADING).astype(np.float32)
+    return np.where(np.isfinite(initial), share * refined + (1 - share) * initial, refined)
 
 
 def _write_products(folder, scene, initial, refined, surface):
