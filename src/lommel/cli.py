@@ -185,8 +185,8 @@ def sfs(
     estimate_haze: Annotated[
         bool | None,
         typer.Option(
-            help="Also estimate an offset per image. Default: where the DEM is interpolated between "
-            "measured posts, as altimetry is."
+            help="Also estimate an offset per image. Default: where the DEM is interpolated "
+            "between measured posts, as altimetry is."
         ),
     ] = None,
     estimate_albedo: Annotated[

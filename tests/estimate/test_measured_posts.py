@@ -35,6 +35,7 @@ def test_tracks_are_found_and_the_planes_between_them_are_not():
     measured = measured_posts(dem)
     inside = at.copy()
     inside[:3], inside[-3:] = False, False
+    inside[:, :30], inside[:, 100:] = False, False  # beside the edge of the data too little is seen
     assert binary_dilation(measured, np.ones((3, 3)))[inside].mean() > 0.95
     near = binary_dilation(at, iterations=3)
     assert (measured & ~near).sum() < 0.02 * measured.sum()

@@ -38,7 +38,7 @@ from lommel.core.normal_operator import (
 DEGREE, LARGEST_DEGREE = 2, 16
 LEFT_SHARE = 0.75
 HOURGLASS = 1 / 64  # share of tr(G): enough against a checkerboard, soft to oblique stripes
-SMALLEST = 5  # posts along the shorter side below which the level is solved directly
+SMALLEST = 9  # posts along the shorter side below which the level is solved directly
 # Levels of the V-cycle that feel the terms of longer waves: those on which these terms weigh
 # against the slopes. Above, they would cost as much as they save.
 LONG_WAVES_FROM = 2

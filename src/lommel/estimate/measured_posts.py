@@ -1,10 +1,10 @@
 """Which posts of a DEM were measured, and which were interpolated between measurements.
 
 Altimeters measure along tracks; what lies between is usually filled with the planes of a
-triangulation. Such a post is no evidence: the height in the middle of a plane may be off by hundreds
-of metres. A plane shows in the second differences. They vanish along at least one direction, where
-measured terrain, rough in every direction, is at most some times smoother in one than in another.
-Most callers want `measured_posts`.
+triangulation. Such a post is no evidence: the height in the middle of a plane may be off by
+hundreds of metres. A plane shows in the second differences. They vanish along at least one
+direction, where measured terrain, rough in every direction, is at most some times smoother in one
+than in another. Most callers want `measured_posts`.
 """
 
 import numpy as np

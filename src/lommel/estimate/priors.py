@@ -253,12 +253,15 @@ def separate(image, gain, spacing):
 
 def _periodogram(image):
     """Windowed power of the central tile and its wave numbers, rad per post."""
-    tile = _central_tile(image).astype(float)
+    tile = _central_tile(image)
     known = np.isfinite(tile)
-    window = np.hanning(tile.shape[0])[:, None] * np.hanning(tile.shape[1])[None, :] * known
-    tile = np.where(known, tile, 0.0)
-    tile = (tile - (window * tile).sum() / max(window.sum(), 1e-12)) * window
-    power = np.abs(np.fft.rfft2(tile)) ** 2 / max((window**2).sum(), 1e-12)
+    along_rows, along_cols = (np.hanning(size).astype(np.float32) for size in tile.shape)
+    window = along_rows[:, None] * along_cols * known
+    tile = np.where(known, tile, np.float32(0))
+    mean = np.vdot(window, tile) / max(window.sum(dtype=float), 1e-12)
+    tile = (tile - np.float32(mean)) * window
+    wave = np.fft.rfft2(tile)
+    power = (wave.real**2 + wave.imag**2) / np.float32(max(np.vdot(window, window), 1e-12))
     k_row = 2 * np.pi * np.fft.fftfreq(tile.shape[0])[:, None]
     k_col = 2 * np.pi * np.fft.rfftfreq(tile.shape[1])[None, :]
     return power, k_row, k_col

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csr_array, eye_array
 from scipy.sparse.linalg import spsolve
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 TERRAIN = -1  # in place of the second image
 STEPS = 12
@@ -287,4 +287,5 @@ def chance_of_agreement(agreeing, tried, tolerance, reach):
     if tried == 0:
         return 0.0
     share = min(np.pi * tolerance**2 / (2.0 * reach) ** 2, 1.0)
-    return float(binom.logsf(agreeing - 1, tried, share) / np.log(10.0))
+    chance = bdtrc(agreeing - 1, tried, share) if agreeing > 0 else 1.0
+    return float(np.log10(max(chance, 1e-300)))

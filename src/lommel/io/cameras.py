@@ -6,11 +6,8 @@ Most callers want `find_camera` and `read_camera`.
 from pathlib import Path
 
 from lommel.errors import InputError, LommelError
-from lommel.io.isd import is_isd, read_isd
-from lommel.io.isis import has_camera, read_isis
-from lommel.io.tsai import read_tsai
 
-READERS = {".json": read_isd, ".isd": read_isd, ".tsai": read_tsai}
+SUFFIXES = (".json", ".isd", ".tsai")
 
 
 def find_camera(image):
@@ -27,10 +24,12 @@ def find_camera(image):
     camera : Path or None
     """
     image = Path(image)
-    for suffix in READERS:
+    for suffix in SUFFIXES:
         path = image.with_suffix(suffix)
-        if path != image and path.exists() and (suffix != ".json" or is_isd(path)):
+        if path != image and path.exists() and (suffix != ".json" or _is_isd(path)):
             return path
+    from lommel.io.isis import has_camera
+
     try:
         return image if has_camera(image) else None
     except LommelError:
@@ -61,12 +60,27 @@ def read_camera(path, shape, kernels=None):
         raise InputError(f"{path}: {error}") from error  # what the models refuse
 
 
+def _is_isd(path):
+    from lommel.io.isd import is_isd
+
+    return is_isd(path)
+
+
 def _read(path, shape, kernels):
-    reader = READERS.get(path.suffix.lower())
+    """Through the one reader it takes: importing all of them would cost half a second."""
+    suffix = path.suffix.lower()
+    if kernels is None and suffix == ".tsai":
+        from lommel.io.tsai import read_tsai
+
+        return read_tsai(path, shape)
+    if kernels is None and suffix in SUFFIXES:
+        from lommel.io.isd import read_isd
+
+        return read_isd(path, shape)
+    from lommel.io.isis import has_camera, read_isis
+
     if kernels is not None:
         return read_isis(path, shape, kernels)
-    if reader is not None:
-        return reader(path, shape)
     try:
         is_cube = has_camera(path)
     except LommelError:
@@ -74,6 +88,6 @@ def _read(path, shape, kernels):
     if not is_cube and path.suffix.lower() != ".cub":
         raise InputError(
             f"{path}: no reader for cameras in {path.suffix or 'nameless'} files. "
-            f"Give one of {', '.join(READERS)}, or an ISIS cube after spiceinit."
+            f"Give one of {', '.join(SUFFIXES)}, or an ISIS cube after spiceinit."
         )
     return read_isis(path, shape)

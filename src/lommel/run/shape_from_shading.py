@@ -5,7 +5,7 @@ Most callers want `run_shape_from_shading`.
 
 import csv
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 from affine import Affine
@@ -22,13 +22,13 @@ from lommel.io.raster import write_raster
 from lommel.run.inputs import GridSettings, SceneFiles
 from lommel.run.photometry import read_known
 from lommel.run.products import RunRecord, output_folder
-from lommel.run.register import settle_cameras
 from lommel.run.views import read_views
 from lommel.scene.grid import Grid
 from lommel.scene.masks import MaskSettings
 
 PARAMETRISATIONS = ("height", "ray")
 WRITERS = 2  # rasters written at a time: each needs twice its size in memory
+DOUBTFUL = 0.3  # correlation with the DEM's image below which an image is checked, for a second
 FADING = 10.0  # posts beyond the images' edge over which their say fades
 LEAST_POSTS = 33  # rows and columns: three octaves of wavelengths
 
@@ -97,7 +97,7 @@ def run_shape_from_shading(
     record = RunRecord("sfs", asdict(settings) | {"grid": asdict(grid_settings or GridSettings())})
     with output_folder(output, overwrite) as folder:
         with record.stage("read"):
-            settled, lost, remark = settle_cameras(files, folder, settings.registers)
+            settled, lost, remark = _settled(files, folder, settings.registers)
             scene = read_views(settled, grid_settings, settings.masks, progress=progress)
             record.add_inputs([*files.images, *files.dems])
             tables = (files.sun_positions, files.spacecraft_positions)
@@ -127,6 +127,8 @@ def run_shape_from_shading(
                 photometry,
                 measured,
             )
+        if not settings.registers:
+            remark = _doubt(files, scene.views, solution.value.correlations, folder)
         with record.stage("write"):
             refined = surface.heights_from_posts(solution.value.u)
             seen = _seen_posts(solution.value.measured)
@@ -140,6 +142,29 @@ def run_shape_from_shading(
         record.outcome = {"name": solution.outcome, "sentence": solution.advice + remark}
         record.write(folder)
     return record.results
+
+
+def _settled(files, folder, registers):
+    """Files with registered cameras, images lost on the way, and a remark."""
+    if not registers:
+        return files, [], ""
+    from lommel.run.register import settle_cameras  # slow to import
+
+    return settle_cameras(files, folder, registers)
+
+
+def _doubt(files, views, correlations, folder):
+    """A remark on raw images that look little like the DEM, when they do not lie on it."""
+    pairs = zip(views, correlations, strict=True)
+    doubtful = {v.name for v, r in pairs if not v.is_projected and not r > DOUBTFUL}
+    if not doubtful:
+        return ""
+    from lommel.run.register import settle_cameras
+
+    kept = [k for k, path in enumerate(files.images) if path.name in doubtful]
+    cameras = tuple(files.cameras[k] for k in kept) if files.cameras else ()
+    images = tuple(files.images[k] for k in kept)
+    return settle_cameras(replace(files, images=images, cameras=cameras), folder)[2]
 
 
 def _refuse_small(grid):

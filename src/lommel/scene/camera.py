@@ -23,12 +23,11 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from lommel.core.multigrid import threads_for
 from lommel.errors import InputError
 from lommel.scene.camera_kernels import look_frame, project_frame
-from lommel.scene.distortion import UNDISTORTED, Distortion
+from lommel.scene.distortion import Distortion, undistorted
 from lommel.scene.geometry import unit
 
 ORTHOGONALITY = 1e-6  # largest entry of M M^T - 1; rotations in files carry about 1e-9
@@ -277,10 +276,12 @@ class FrameCamera(Camera):
 
     @property
     def _lens(self):
-        return (self.distortion or UNDISTORTED).lens
+        return (self.distortion or undistorted()).lens
 
     def adjusted(self, rotation, shift):
         """The same camera, turned and moved a little; see `Camera.adjusted`."""
+        from scipy.spatial.transform import Rotation  # slow to import
+
         turn = Rotation.from_rotvec(np.asarray(rotation, float)).as_matrix()
         return replace(
             self, position=self.position + np.asarray(shift, float), rotation=turn @ self.rotation

@@ -42,6 +42,7 @@ The closed forms are those of ISIS 9 (``CameraDistortionMap``, ``ApolloMetricDis
 """
 
 from dataclasses import dataclass, field
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -142,4 +143,7 @@ class Distortion:
         return tuple(out.reshape(2, *x.shape))
 
 
-UNDISTORTED = Distortion("none")
+@cache
+def undistorted():
+    """The lens of a pinhole camera."""
+    return Distortion("none")

@@ -17,12 +17,11 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from lommel.core.multigrid import threads_for
 from lommel.errors import InputError
 from lommel.scene.camera import UPRIGHT, Camera, FocalPlane, focal_plane
-from lommel.scene.distortion import UNDISTORTED, Distortion
+from lommel.scene.distortion import Distortion, undistorted
 from lommel.scene.line_scan_kernels import look_line_scan, project_line_scan
 from lommel.scene.motion import Pointing, Trajectory
 
@@ -164,7 +163,7 @@ class LineScanCamera(Camera):
 
     @property
     def _lens(self):
-        return (self.distortion or UNDISTORTED).lens
+        return (self.distortion or undistorted()).lens
 
     def project(self, xyz):
         """Image coordinates of ground points; see `Camera.project`.
@@ -203,6 +202,8 @@ class LineScanCamera(Camera):
 
     def adjusted(self, rotation, shift):
         """The same camera, turned and moved alike at all lines; see `Camera.adjusted`."""
+        from scipy.spatial.transform import Rotation  # slow to import
+
         turn = Rotation.from_rotvec(np.asarray(rotation, float)).as_matrix()
         return replace(
             self, trajectory=self.trajectory.shifted(shift), pointing=self.pointing.turned(turn)
