@@ -349,8 +349,8 @@ def light_planes(frame, view, model):
     return np.stack([*planes, share, factor]).astype(np.float32)
 
 
-def cos_incidence(surface, u, view):
-    """Cosine of incidence on the cells of a surface, under the Sun of a view.
+def lambert_image(surface, u, view):
+    """Cosine of incidence on the cells of a surface, under the Sun of a view; 0 where turned away.
 
     Parameters
     ----------
@@ -360,17 +360,11 @@ def cos_incidence(surface, u, view):
 
     Returns
     -------
-    cosine : float32 array (rows - 1, cols - 1), dimensionless; negative where turned away
+    cosine : float32 array (rows - 1, cols - 1), dimensionless
     """
-    distance = np.linalg.norm(view.position) - surface.grid.body.radius
-    lattice = surface.lattice(u.shape, 1, distance)
-    frame = surface.frame(lattice, lattice_heights(u, lattice))
-    light = light_planes(frame, view, reflectance_model("lambert"))
-    planes = np.empty((4, u.shape[0] - 1, u.shape[1] - 1), np.float32)
-    spacing = np.array(surface.grid.spacing, np.float32)
-    with threads_for(u.shape):
-        cosines(u, frame.gram.astype(np.float32), light, lattice.step, spacing, planes)
-    return planes[0]
+    level = fresh_problem(surface, u, [view], reflectance_model("lambert"), None)
+    level.prepare_geometry(u)
+    return level.predict(u, 0)
 
 
 def lattice_heights(u, lattice):

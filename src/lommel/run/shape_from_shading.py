@@ -4,7 +4,8 @@ Most callers want `run_shape_from_shading`.
 """
 
 import csv
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from lommel.errors import InputError
 from lommel.estimate.holes import fill_holes
 from lommel.estimate.measured_posts import measured_posts
 from lommel.estimate.priors import PriorSettings
-from lommel.estimate.problem import cos_incidence
+from lommel.estimate.problem import lambert_image
 from lommel.estimate.shape_from_shading import SolverSettings, correlation, solve_surface
 from lommel.estimate.surface import Surface
 from lommel.io.raster import write_raster
@@ -135,9 +136,10 @@ def run_shape_from_shading(
             if measured is not None:
                 refined = faded(refined, scene.heights, seen)
             refined[~(known | seen)] = np.nan
-            _write_products(folder, scene, initial, refined, solution.value)
+            residual = relative_residual(solution.value)
+            _write_products(folder, scene, initial, refined, solution.value, residual)
             _write_exposures(folder, scene.views, record.skipped, solution.value)
-        record.results = _results(scene, refined, solution.value)
+        record.results = _results(scene, refined, solution.value, residual)
         record.history = solution.history
         record.outcome = {"name": solution.outcome, "sentence": solution.advice + remark}
         record.write(folder)
@@ -207,25 +209,39 @@ def faded(refined, initial, seen):
     return np.where(np.isfinite(initial), share * refined + (1 - share) * initial, refined)
 
 
-def _write_products(folder, scene, initial, refined, surface):
-    grid = scene.grid
+def _write_products(folder, scene, initial, refined, surface, residual):
+    grid, view = scene.grid, scene.views[0]
     cells = cell_grid(grid)
-    modelled = np.where(np.isfinite(surface.measured[0]), surface.modelled[0], np.nan)
+    shade = "cosine of incidence", "1"
     products = {
-        "dem": (refined, grid, "height", "m"),
-        "initial-dem": (scene.heights, grid, "height", "m"),
-        "measured": (surface.measured[0], cells, "measured brightness"),
-        "modelled": (modelled, cells, "modelled brightness"),
-        "albedo": (surface.albedo, cells, "albedo"),
-        "separation": (surface.separation, cells, "slope signal left by a free albedo", "1"),
-        "residual": (relative_residual(surface), cells, "rms of modelled - measured", "percent"),
+        "dem": lambda: (refined, grid, "height", "m"),
+        "initial-dem": lambda: (scene.heights, grid, "height", "m"),
+        "measured": lambda: (surface.measured[0], cells, "measured brightness"),
+        "modelled": lambda: (_modelled_where_measured(surface), cells, "modelled brightness"),
+        "albedo": lambda: (surface.albedo, cells, "albedo"),
+        "separation": lambda: (
+            surface.separation,
+            cells,
+            "slope signal left by a free albedo",
+            "1",
+        ),
+        "residual": lambda: (residual, cells, "rms of modelled - measured", "percent"),
+        "hillshade-before": lambda: (hillshade(grid, initial, view), cells, *shade),
+        "hillshade-after": lambda: (hillshade(grid, refined, view), cells, *shade),
     }
-    for name, heights in (("before", initial), ("after", refined)):
-        shade = hillshade(grid, heights, scene.views[0])
-        products[f"hillshade-{name}"] = (shade, cells, "cosine of incidence", "1")
+    waiting: deque[Future] = deque()
     with ThreadPoolExecutor(WRITERS) as pool:  # GDAL compresses outside Python's lock
-        paths = (folder / f"{name}.tif" for name in products)
-        list(pool.map(lambda path, product: write_raster(path, *product), paths, products.values()))
+        for name, product in products.items():
+            if len(waiting) == WRITERS:
+                waiting.popleft().result()
+            waiting.append(pool.submit(write_raster, folder / f"{name}.tif", *product()))
+        for writing in waiting:
+            writing.result()
+
+
+def _modelled_where_measured(surface):
+    measured = surface.measured[0]
+    return np.where(np.isfinite(measured), surface.modelled[0], np.float32(np.nan))
 
 
 def cell_grid(grid):
@@ -249,7 +265,7 @@ def hillshade(grid, heights, view):
     """
     surface = Surface(grid, float(np.nanmean(heights, dtype=float)))
     u = surface.posts_from_heights(heights)
-    return np.maximum(cos_incidence(surface, u, view), np.float32(0))
+    return lambert_image(surface, u, view)
 
 
 def relative_residual(surface):
@@ -284,9 +300,9 @@ def _write_exposures(folder, views, skipped, surface):
             writer.writerow([skip["image"], "", "", "", 0, skip["reason"]])
 
 
-def _results(scene, refined, surface):
+def _results(scene, refined, surface, residual):
     change = refined - scene.heights
-    shading = [model / surface.albedo for model in surface.modelled]
+    shading = (model / surface.albedo for model in surface.modelled)
     priors = surface.priors
     brightness = [np.nanmedian(image) for image in surface.measured]
     return {
@@ -294,7 +310,7 @@ def _results(scene, refined, surface):
         "image_correlation_before": float(np.mean(surface.correlations)),
         "image_correlation_after": _mean_correlation(surface.measured, surface.modelled),
         "image_correlation_without_albedo": _mean_correlation(surface.measured, shading),
-        "image_residual_percent": float(np.sqrt(np.nanmean(relative_residual(surface) ** 2))),
+        "image_residual_percent": float(np.sqrt(np.nanmean(residual**2))),
         "height_change_rms_m": float(np.sqrt(np.nanmean(change**2))),
         "noise_percent": float(100 * np.mean(priors.noise / brightness)),
         "terrain_roughness_deg": float(np.degrees(priors.roughness)),
