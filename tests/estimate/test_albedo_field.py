@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lommel.estimate.albedo_field import fit_albedo
+from lommel.estimate.albedo_field import albedo_information, fit_albedo
 
 NOISE = 3.0  # image units of 60
 CONTRAST = 0.005  # rms difference of neighbouring cells
@@ -25,7 +25,8 @@ def pictures(albedo, seeds=(0, 1, 2)):
 
 def fit(albedo, measured, shading):
     start = np.ones(albedo.shape, np.float32)
-    return fit_albedo(shading, measured, np.full(len(measured), NOISE), CONTRAST, start)
+    images = ((*pair, NOISE) for pair in zip(shading, measured, strict=True))
+    return fit_albedo(*albedo_information(albedo.shape, images), CONTRAST, start)
 
 
 def test_noise_is_smoothed_away():

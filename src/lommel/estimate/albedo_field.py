@@ -22,16 +22,37 @@ REWEIGHTINGS = 3  # the first is least squares; two more settle the borders
 EDGE = 3.0  # times the expected difference: a border of units from there on
 
 
-def fit_albedo(shading, measured, noise, contrast, start):
+def albedo_information(shape, images):
+    """What images tell of each cell's albedo.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Rows and columns.
+    images : iterable of (shading, measured, noise)
+        Exposure times reflectance, and the measured brightness without haze, NaN where not used:
+        float32 arrays (rows, cols), image units; and the standard error of the latter.
+
+    Returns
+    -------
+    weight, pull : float32 array (rows, cols)
+        Inverse squared standard error, and the same times the albedo.
+    """
+    weight, pull = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    for shading, measured, noise in images:
+        used = np.where(np.isfinite(measured), np.float32(noise**-2.0), np.float32(0)) * shading
+        weight += used * shading
+        pull += np.where(used > 0, used * measured, np.float32(0))
+    return weight, pull
+
+
+def fit_albedo(weight, pull, contrast, start):
     """Albedo of every cell.
 
     Parameters
     ----------
-    shading : list of float32 array (rows, cols), image units
-        Exposure times reflectance of each image.
-    measured : list of float32 array (rows, cols), image units
-        Haze subtracted; NaN where not used.
-    noise : array (images,), image units
+    weight, pull : float32 array (rows, cols)
+        From `albedo_information`.
     contrast : float, dimensionless
         Standard deviation of the difference between neighbouring cells.
     start : float32 array (rows, cols)
@@ -41,7 +62,6 @@ def fit_albedo(shading, measured, noise, contrast, start):
     -------
     albedo : float32 array (rows, cols)
     """
-    weight, pull = _information(shading, measured, noise)
     albedo = start
     stiffness = np.full((start.shape[0] - 1, start.shape[1] - 1), contrast**-2.0, np.float32)
     for _ in range(REWEIGHTINGS):
@@ -50,36 +70,26 @@ def fit_albedo(shading, measured, noise, contrast, start):
     return albedo
 
 
-def observed_contrast(shading, measured, noise):
+def observed_contrast(weight, pull):
     """Standard deviation of the albedo's difference between neighbours, as the images show it.
 
     Meant for images that tell each cell's albedo by themselves; their noise is taken off.
 
     Parameters
     ----------
-    shading, measured, noise
-        As in `fit_albedo`.
+    weight, pull : float32 array (rows, cols)
+        From `albedo_information`.
 
     Returns
     -------
     contrast : float, dimensionless; 0 when noise explains all differences
     """
-    weight, pull = _information(shading, measured, noise)
     seen = np.where(weight > 0, weight, np.float32(np.nan))
     albedo = pull / seen
-    differences = np.concatenate([np.diff(albedo, axis=axis).ravel() ** 2 for axis in (0, 1)])
-    return float(max(np.nanmean(differences) - 2 * np.nanmean(1 / seen), 0.0) ** 0.5)
-
-
-def _information(shading, measured, noise):
-    """Weight of each cell's albedo, and weight times albedo, summed over the images."""
-    weight = np.zeros(shading[0].shape, np.float32)
-    pull = np.zeros_like(weight)
-    for shade, image, sigma in zip(shading, measured, noise, strict=True):
-        used = np.where(np.isfinite(image), np.float32(sigma**-2.0), np.float32(0))
-        weight += used * shade * shade
-        pull += used * shade * np.where(used > 0, image, np.float32(0))
-    return weight, pull
+    squares = [np.diff(albedo, axis=axis) ** 2 for axis in (0, 1)]
+    count = sum(np.isfinite(square).sum() for square in squares)
+    mean = sum(np.nansum(square, dtype=float) for square in squares) / max(count, 1)
+    return float(max(mean - 2 * np.nanmean(1 / seen), 0.0) ** 0.5)
 
 
 def _step(albedo, weight, pull, stiffness):

@@ -26,7 +26,11 @@ import numpy as np
 from lommel.core.least_squares import Solution
 from lommel.core.multigrid import NormalEquations, conjugate_gradients, dot
 from lommel.core.normal_operator import prolong_add
-from lommel.estimate.albedo_field import fit_albedo, observed_contrast
+from lommel.estimate.albedo_field import (
+    albedo_information,
+    fit_albedo,
+    observed_contrast,
+)
 from lommel.estimate.priors import Priors, PriorSettings, estimate_priors
 from lommel.estimate.problem import best_photometry, exposure_gain, fresh_problem
 from lommel.estimate.shading_kernels import SUM_COUNT, SUM_RR
@@ -414,16 +418,19 @@ def _set_photometry(level, sums, settings):
 
 def _fit_albedo(level, u, priors, misfits, settings):
     """Albedo of the cells, given the surface; exposures that are free keep its mean at 1."""
-    images = range(len(level.views))
-    shading = [(level.predict(u, k) - level.hazes[k]) / level.albedo for k in images]
-    without_haze = [c - haze for c, haze in zip(level.cells, level.hazes, strict=True)]
-    noise, contrast = priors.noise, priors.albedo_contrast
-    if priors.albedo_error > 0:  # the images themselves show what noise and albedo are like
-        freedom = len(level.views) - CELL_UNKNOWNS
-        if freedom > 0:
-            noise = noise * np.minimum(misfits * (len(level.views) / freedom) ** 0.5, 1.0)
-        contrast = max(contrast, observed_contrast(shading, without_haze, noise))
-    level.albedo = fit_albedo(shading, without_haze, noise, contrast, level.albedo)
+    level.memory.clear()
+    count, noise, contrast = len(level.views), priors.noise, priors.albedo_contrast
+    shows_albedo = priors.albedo_error > 0
+    if shows_albedo and count > CELL_UNKNOWNS:  # then the images themselves show their noise, too
+        noise = noise * np.minimum(misfits * (count / (count - CELL_UNKNOWNS)) ** 0.5, 1.0)
+    images = (
+        ((level.predict(u, k) - haze) / level.albedo, level.cells[k] - haze, noise[k])
+        for k, haze in enumerate(level.hazes.astype(np.float32))
+    )
+    weight, pull = albedo_information(level.albedo.shape, images)
+    if shows_albedo:
+        contrast = max(contrast, observed_contrast(weight, pull))
+    level.albedo = fit_albedo(weight, pull, contrast, level.albedo)
     if settings.estimate_exposure:
         level.albedo /= np.float32(level.albedo.mean(dtype=float))
         _set_photometry(level, level.assemble(u)[2], settings)
