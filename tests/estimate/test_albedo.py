@@ -9,7 +9,7 @@ from lommel.estimate import albedo as solver
 from lommel.estimate.albedo import estimate_albedo
 from lommel.estimate.albedo_arrays import OWN, SHARED, State
 from lommel.estimate.albedo_equations import normal_equations, visit
-from lommel.estimate.albedo_samples import collect_samples
+from lommel.estimate.albedo_samples import SampleBlocks, collect_samples
 from lommel.estimate.albedo_settings import AlbedoSettings, published_settings
 from lommel.scene.masks import MaskSettings
 
@@ -128,10 +128,11 @@ def test_published_step_is_the_papers():
 def problem_at(scene, settings, shift=0.0, seed=1):
     """A problem, and a function from parameters to the point of one least-squares pass."""
     model = reflectance_model(settings.reflectance)
-    samples, levels, _ = collect_samples(
+    blocks = SampleBlocks(
         scene.observations, scene.grid, scene.heights, model, settings.masks, settings.slope_noise
     )
-    problem = solver._pose(samples, scene.grid.shape, settings)
+    levels = blocks.levels
+    problem = solver._pose(blocks, settings)
     rng = np.random.default_rng(seed)
     size = OWN * problem.images + SHARED + 1
     start = shift * rng.normal(size=size)

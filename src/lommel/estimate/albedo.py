@@ -41,14 +41,13 @@ from lommel.estimate.albedo_equations import (
     standard_errors,
     visit,
 )
-from lommel.estimate.albedo_quality import disagreement
-from lommel.estimate.albedo_samples import collect_samples, orthomosaic, overlapping_pairs
+from lommel.estimate.albedo_maps import LastPass, MapRows, WholeMaps
+from lommel.estimate.albedo_samples import SampleBlocks, overlapping_pairs
 from lommel.estimate.albedo_settings import AlbedoSettings, check_settings
 
 SETTLED = 0.02  # change of the log noise scale from which scale and repetition are kept
 SETTLING = 8  # passes at most until then; from there on the cost keeps its meaning
 LONGEST = 0.5  # change of any unknown in one step; all are logarithms or of order 1
-FREE_SHARE = 4.0  # images whose scatter the overall noise counts for in the error of one post
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +57,7 @@ class AlbedoResult:
     Attributes
     ----------
     albedo : float32 array (rows, cols), dimensionless; NaN where no image sees the ground
+        Like the next three, None when the rows were taken by a function.
     albedo_error : float32 array (rows, cols); NaN with one image
         Standard error from the scatter of the images, and of all residuals where few see the post.
     orthomosaic : float32 array (rows, cols), image units
@@ -78,15 +78,17 @@ class AlbedoResult:
         Standard error of a residual, as a share of the image's level.
     repetition : float
         Pixels per independent residual.
+    passes : int
+        Over all images.
     history : list of dict
         Cost and its change for each step from which the noise scale was kept.
     outcome, advice : str
     """
 
-    albedo: np.ndarray
-    albedo_error: np.ndarray
-    orthomosaic: np.ndarray
-    count: np.ndarray
+    albedo: np.ndarray | None
+    albedo_error: np.ndarray | None
+    orthomosaic: np.ndarray | None
+    count: np.ndarray | None
     exposures: np.ndarray
     exposure_errors: np.ndarray
     hazes: np.ndarray
@@ -99,12 +101,13 @@ class AlbedoResult:
     disagreement: float
     noise: float
     repetition: float
+    passes: int
     history: list[dict]
     outcome: str
     advice: str
 
 
-def estimate_albedo(observations, grid, heights, settings=None, progress=None):
+def estimate_albedo(observations, grid, heights, settings=None, progress=None, take=None):
     """Albedo, exposures and haze from images on one grid.
 
     Parameters
@@ -115,6 +118,9 @@ def estimate_albedo(observations, grid, heights, settings=None, progress=None):
     settings : AlbedoSettings, optional
     progress : callable, optional
         Called with (pass, objective) after each pass over the images.
+    take : function (first row, MapRows), optional
+        Takes the maps some rows at a time, from several threads in any order; else the result
+        holds them whole.
 
     Returns
     -------
@@ -123,20 +129,18 @@ def estimate_albedo(observations, grid, heights, settings=None, progress=None):
     settings = settings or AlbedoSettings()
     check_settings(settings)
     model = reflectance_model(settings.reflectance)
-    samples, levels, reasons = collect_samples(
-        observations, grid, heights, model, settings.masks, settings.slope_noise
-    )
-    if not len(levels):
-        listing = [f"  {o.name}: {r}" for o, r in zip(observations, reasons, strict=True)]
+    blocks = SampleBlocks(observations, grid, heights, model, settings.masks, settings.slope_noise)
+    if not len(blocks.levels):
+        listing = [f"  {o.name}: {r}" for o, r in zip(observations, blocks.reasons, strict=True)]
         raise InputError("No image can be used.\n" + "\n".join(listing[:20]))
-    problem = _pose(samples, grid.shape, settings)
-    solution = _iterate(problem, levels, progress or (lambda *_: None))
-    return _result(problem, solution, reasons)
+    problem = _pose(blocks, settings)
+    solution, passes = _iterate(problem, progress or (lambda *_: None))
+    return _result(problem, solution, passes + 1, take)
 
 
-def _pose(samples, shape, settings):
+def _pose(blocks, settings):
     """Layout of the unknowns; the alternating solver knows exposure and haze only."""
-    images = len(samples.starts)
+    images = len(blocks.levels)
     with_priors = settings.solver == "projection"
     own = np.tile([True, settings.haze], images)
     fits_phase = with_priors and settings.fit_phase_factor and settings.phase_factor is not None
@@ -144,16 +148,16 @@ def _pose(samples, shape, settings):
     shared = [fits_phase, fits_phase, fits_falloff, fits_falloff, with_priors]
     start = np.array([*(settings.phase_factor or (0.0, 0.0)), 0.0, 0.0])
     is_fitted = np.concatenate([own, shared])
-    return Problem(samples, overlapping_pairs(samples.windows), shape, settings, is_fitted, start)
+    return Problem(blocks, overlapping_pairs(blocks.windows), settings, is_fitted, start)
 
 
-def _iterate(problem, levels, progress):
-    """Steps until the cost stays; the solution's value is the last point."""
-    settings = problem.settings
+def _iterate(problem, progress):
+    """Steps until the cost stays; the solution, its value the last point, and how many passes."""
+    settings, levels = problem.settings, problem.blocks.levels
     state = State(
         levels / levels.mean(),
         np.zeros(problem.images),
-        _mean_brightness(problem.samples),
+        problem.blocks.brightness,
         problem.shared_start,
     )
     point = visit(problem, state, np.log(levels.mean()), 1.0, 1.0)
@@ -179,24 +183,18 @@ def _iterate(problem, levels, progress):
         history.append({"step": step + 1, "cost": point.objective, "change": change})
         if abs(change) < settings.tolerance:
             advice = f"Converged after {step + 1} steps."
-            return Solution(point, "converged", advice, history)
+            return Solution(point, "converged", advice, history), step + 2
     advice = (
         f"Stopped after {settings.max_steps} steps while the cost still changed by "
         f"{100 * abs(change):.2g} % per step; raise max_steps."
     )
-    return Solution(point, "step_limit", advice, history)
+    return Solution(point, "step_limit", advice, history), settings.max_steps + 1
 
 
 def _weighting(point):
     """Noise scale and repetition that the residuals show; 1 where one image shows none."""
     scale = noise_scale(point.sums.histogram)
     return scale if np.isfinite(scale) else 1.0, effective_repetition(point.sums)
-
-
-def _mean_brightness(samples):
-    """Weighted mean of each image's used pixels, image units."""
-    weight = np.add.reduceat(samples.weight.astype(float), samples.starts)
-    return np.add.reduceat(samples.weight.astype(float) * samples.measured, samples.starts) / weight
 
 
 def _step(problem, point, damping):
@@ -234,13 +232,14 @@ def _published_step(problem, point):
     return change.ravel()
 
 
-def _result(problem, solution, reasons):
-    """Bring the gauge to mean exposure 1, and collect."""
-    point = solution.value
+def _result(problem, solution, passes, take):
+    """Bring the gauge to mean exposure 1, and collect; one more pass leaves the maps."""
+    point, reasons = solution.value, problem.blocks.reasons
     used = np.array([not reason for reason in reasons])
+    weighted_with = point.scale
     point.scale, point.repetition = _weighting(point)
     noise = noise_scale(point.sums.histogram)
-    state, maps = point.state, point.maps
+    state = point.state
     gauge = state.exposure.mean()
     errors = standard_errors(problem, point)
     own = errors[: OWN * problem.images].reshape(-1, OWN)
@@ -250,16 +249,14 @@ def _result(problem, solution, reasons):
         everyone[used] = values
         return everyone
 
-    seen = maps.image_count > 0
+    whole = WholeMaps(problem.blocks.grid.shape) if take is None else None
+    last_pass = LastPass(state, noise, problem.blocks.pixels, take or whole)
+    visit(problem, state, point.mean_log_albedo, weighted_with, 1.0, last_pass)
+    before, after = last_pass.disagreements()
     groups = connected_groups(problem, point)
     indices = np.flatnonzero(used)
     return AlbedoResult(
-        albedo=np.where(seen, gauge * maps.albedo, np.nan).astype(np.float32),
-        albedo_error=np.where(seen, gauge * _albedo_error(point.maps, noise), np.nan).astype(
-            np.float32
-        ),
-        orthomosaic=orthomosaic(problem.samples, problem.shape),
-        count=maps.image_count,
+        **(dict.fromkeys(MapRows.__annotations__) if whole is None else vars(whole.rows)),
         exposures=per_image(state.exposure / gauge),
         exposure_errors=per_image(state.exposure / gauge * own[:, 0]),
         hazes=per_image(state.haze),
@@ -270,12 +267,11 @@ def _result(problem, solution, reasons):
             problem.is_fitted[-SHARED - 1 : -1], errors[-SHARED - 1 : -1], np.nan
         ),
         groups=tuple(tuple(indices[group].tolist()) for group in groups),
-        disagreement_before=disagreement(problem.samples, problem.shape),
-        disagreement=disagreement(
-            problem.samples, problem.shape, state.exposure, state.haze, state.shared
-        ),
+        disagreement_before=before,
+        disagreement=after,
         noise=noise,
         repetition=point.repetition,
+        passes=passes,
         history=solution.history,
         outcome=solution.outcome,
         advice=solution.advice + _remarks(problem, groups),
@@ -292,18 +288,3 @@ def _remarks(problem, groups):
             "the other rests on albedo_contrast alone."
         )
     return ""
-
-
-def _albedo_error(maps, noise):
-    r"""Standard error of the albedo of each post.
-
-    .. math:: \sigma_A^2 = \frac{\nu s^2 + \sum_k w r^2}{\nu + f} \;
-              \frac{\sum_k w^2 M^2 / \pi}{(\sum_k w M^2)^2}
-
-    with precision :math:`\pi`, the residuals r of the f free images of the post, and the overall
-    noise s counting for :math:`\nu = 4` images more, so that a post seen once has an error too.
-    NaN with one image, whose errors nothing shows.
-    """
-    variance = (FREE_SHARE * noise**2 + maps.scatter) / (FREE_SHARE + maps.freedom)
-    information = np.maximum(maps.information, 1e-300)
-    return np.sqrt(variance * maps.spread) / information

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-BLOCKS = 32  # blocks of rows, fixed so that sums do not depend on the number of threads
+BLOCKS = 32  # of rows at least; the scene fixes them, so sums do not depend on the threads
 OWN = 2  # parameters of one image: log exposure, haze
 SHARED = 4  # parameters of all images: c1, c2, v2, v4
 PATCHES = 8  # patches along each side of an image, in which residuals are summed
@@ -159,21 +159,21 @@ class Work(NamedTuple):
     residual: np.ndarray
 
 
-def empty_sums(images, pairs):
+def empty_sums(images, pairs, blocks=BLOCKS):
     """Sums of nothing."""
     return Sums(
-        own=np.zeros((BLOCKS, images, OWN, OWN)),
-        pairs=np.zeros((BLOCKS, pairs, OWN, OWN)),
-        shared_pixels=np.zeros((BLOCKS, pairs)),
-        border=np.zeros((BLOCKS, images, OWN, SHARED)),
-        square=np.zeros((BLOCKS, SHARED, SHARED)),
-        gradient=np.zeros((BLOCKS, images, OWN)),
-        shared_gradient=np.zeros((BLOCKS, SHARED)),
-        means=np.zeros((BLOCKS, images, 3 + SHARED)),
-        patches=np.zeros((BLOCKS, images, PATCHES, PATCHES)),
-        score_square=np.zeros((BLOCKS, 1)),
-        histogram=np.zeros((BLOCKS, SCALE_BINS)),
-        cost=np.zeros((BLOCKS, 1)),
+        own=np.zeros((blocks, images, OWN, OWN)),
+        pairs=np.zeros((blocks, pairs, OWN, OWN)),
+        shared_pixels=np.zeros((blocks, pairs)),
+        border=np.zeros((blocks, images, OWN, SHARED)),
+        square=np.zeros((blocks, SHARED, SHARED)),
+        gradient=np.zeros((blocks, images, OWN)),
+        shared_gradient=np.zeros((blocks, SHARED)),
+        means=np.zeros((blocks, images, 3 + SHARED)),
+        patches=np.zeros((blocks, images, PATCHES, PATCHES)),
+        score_square=np.zeros((blocks, 1)),
+        histogram=np.zeros((blocks, SCALE_BINS)),
+        cost=np.zeros((blocks, 1)),
     )
 
 

@@ -18,16 +18,14 @@ from lommel.estimate.albedo_arrays import (
     SCALE_LOW,
     SCALE_STEP,
     SHARED,
-    Maps,
     Pairs,
-    Samples,
     State,
     Sums,
-    empty_maps,
     empty_sums,
 )
 from lommel.estimate.albedo_kernels import accumulate
 from lommel.estimate.albedo_rows import LOSSES
+from lommel.estimate.albedo_samples import SampleBlocks
 from lommel.estimate.albedo_settings import AlbedoSettings
 
 # Prior standard errors of c1, c2, v2, v4. A strip under one Sun cannot tell phase from a trend of
@@ -42,19 +40,16 @@ class Problem:
 
     Attributes
     ----------
-    samples : Samples
+    blocks : SampleBlocks
     pairs : Pairs
-    shape : tuple of int
-        Of the grid.
     settings : AlbedoSettings
     is_fitted : bool array (2 K + 5,)
         Log exposure and haze of each image, then c1, c2, v2, v4 and the mean log albedo.
     shared_start : float64 array (4,)
     """
 
-    samples: Samples
+    blocks: SampleBlocks
     pairs: Pairs
-    shape: tuple[int, int]
     settings: AlbedoSettings
     is_fitted: np.ndarray
     shared_start: np.ndarray
@@ -62,12 +57,12 @@ class Problem:
     @property
     def images(self):
         """Number of images used."""
-        return len(self.samples.starts)
+        return len(self.blocks.levels)
 
 
 @dataclass(eq=False)
 class Point:
-    """One pass: the parameters, and the sums and maps that belong to them.
+    """One pass: the parameters, and the sums that belong to them.
 
     Attributes
     ----------
@@ -75,7 +70,6 @@ class Point:
     mean_log_albedo : float
     scale, repetition : float
         What the pass was weighted with.
-    maps : Maps
     sums : Sums, blocks added up
     objective : float
     """
@@ -84,19 +78,17 @@ class Point:
     mean_log_albedo: float
     scale: float
     repetition: float
-    maps: Maps
     sums: Sums
     objective: float
 
 
-def visit(problem, state, mean_log_albedo, scale, repetition):
-    """One pass over the images: the sums, maps and objective at these parameters."""
-    blocks = empty_sums(problem.images, len(problem.pairs.second))
-    maps = empty_maps(problem.shape)
+def visit(problem, state, mean_log_albedo, scale, repetition, keep=None):
+    """One pass over the images: the sums and objective at these parameters; see `accumulate`."""
+    blocks = empty_sums(problem.images, len(problem.pairs.second), problem.blocks.count)
     loss = LOSSES[problem.settings.loss]
-    accumulate(problem.samples, problem.pairs, state, scale, loss, maps, blocks)
+    accumulate(problem.blocks, problem.pairs, state, scale, loss, blocks, keep)
     sums = Sums(*(part.sum(axis=0) for part in blocks))
-    point = Point(state, mean_log_albedo, scale, repetition, maps, sums, 0.0)
+    point = Point(state, mean_log_albedo, scale, repetition, sums, 0.0)
     point.objective = float(sums.cost[0]) / repetition
     if problem.settings.solver == "projection":
         residual, _, error = priors(problem, point)

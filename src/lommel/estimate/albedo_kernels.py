@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numba import get_num_threads, njit
 
-from lommel.estimate.albedo_arrays import BLOCKS, OWN, PATCHES, SHARED, Sums, Work
+from lommel.estimate.albedo_arrays import OWN, PATCHES, SHARED, Sums, Work, empty_maps
 from lommel.estimate.albedo_rows import (
     LEAST_SQUARES,
     brightness_row,
@@ -37,9 +37,9 @@ SWEEPS = 5  # weightings of the pixels of a post; the robust mean then moves bel
 
 
 @inner
-def _first_sweep(row, samples, images, state, work, maps):
+def _first_sweep(row, here, samples, images, state, work, maps):
     """Brightness of every image in this row, and how many there are."""
-    count, freedom = maps.image_count[row], maps.freedom[row]
+    count, freedom = maps.image_count[here], maps.freedom[here]
     count[:], freedom[:] = 0, 0.0
     for a in range(images.size):
         k = images[a]
@@ -61,13 +61,13 @@ def _first_sweep(row, samples, images, state, work, maps):
 
 
 @inner
-def _best_albedo(row, samples, images, state, scale, loss, work, maps):
+def _best_albedo(row, here, samples, images, state, scale, loss, work, maps):
     """Albedo of this row by repeated weighting, from the plain weighted mean on.
 
     It depends on the image parameters alone, not on the pass before, so that the cost is a function
     of these parameters.
     """
-    albedo, bottom, spread = maps.albedo[row], maps.information[row], maps.spread[row]
+    albedo, bottom, spread = maps.albedo[here], maps.information[here], maps.spread[here]
     for sweep in range(1 if loss == LEAST_SQUARES else SWEEPS):
         work.top[:], bottom[:], spread[:] = 0.0, 0.0, 0.0
         for a in range(images.size):
@@ -94,9 +94,9 @@ def _best_albedo(row, samples, images, state, scale, loss, work, maps):
 
 
 @inner
-def _second_sweep(row, samples, images, state, scale, loss, work, sums, maps):
+def _second_sweep(row, here, samples, images, state, scale, loss, work, sums, maps):
     """Sums of every image in this row, given the albedo."""
-    albedo, scatter, count = maps.albedo[row], maps.scatter[row], maps.image_count[row]
+    albedo, scatter, count = maps.albedo[here], maps.scatter[here], maps.image_count[here]
     work.u_shared[:] = 0.0
     scatter[:] = 0.0
     for a in range(images.size):
@@ -226,12 +226,12 @@ def _most_images(first_row, last_row, samples):
 
 
 @inner
-def _work_for(images, cols):
+def _work_for(images, widest, cols):
     return Work(
-        np.zeros((images, cols)),
-        np.zeros((images, SHARED, cols)),
-        np.zeros((images, cols)),
-        np.zeros((images, OWN, cols)),
+        np.zeros((images, widest)),
+        np.zeros((images, SHARED, widest)),
+        np.zeros((images, widest)),
+        np.zeros((images, OWN, widest)),
         np.zeros((SHARED, cols)),
         np.zeros(cols),
         np.zeros(cols),
@@ -241,22 +241,23 @@ def _work_for(images, cols):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _visit_rows(first_row, last_row, samples, pairs, state, scale, loss, maps, sums):
-    work = _work_for(_most_images(first_row, last_row, samples), maps.albedo.shape[1])
+    widest = np.max(samples.windows[:, 3])
+    work = _work_for(_most_images(first_row, last_row, samples), widest, maps.albedo.shape[1])
     place_of = np.empty(samples.starts.size, np.int64)
     for row in range(first_row, last_row):
-        images = _images_in(row, samples, place_of)
-        _first_sweep(row, samples, images, state, work, maps)
-        _best_albedo(row, samples, images, state, scale, loss, work, maps)
-        _second_sweep(row, samples, images, state, scale, loss, work, sums, maps)
+        images, here = _images_in(row, samples, place_of), row - first_row
+        _first_sweep(row, here, samples, images, state, work, maps)
+        _best_albedo(row, here, samples, images, state, scale, loss, work, maps)
+        _second_sweep(row, here, samples, images, state, scale, loss, work, sums, maps)
         _eliminate(samples, images, pairs, place_of, work, sums)
 
 
-def accumulate(samples, pairs, state, scale, loss, maps, sums):
+def accumulate(blocks, pairs, state, scale, loss, sums, keep=None):
     """Visit every pixel once: best albedo, then the sums of a Gauss-Newton step.
 
     Parameters
     ----------
-    samples : Samples
+    blocks : SampleBlocks
     pairs : Pairs
     state : State
         Image parameters and shared parameters.
@@ -264,19 +265,22 @@ def accumulate(samples, pairs, state, scale, loss, maps, sums):
         Standard error of a residual times the root of its precision.
     loss : int
         LEAST_SQUARES, HUBER or CAUCHY.
-    maps : Maps
-        Overwritten.
     sums : Sums
         Zeros from `empty_sums`; added to.
+    keep : function (first, last, samples, maps), optional
+        Called for each block of rows from first to before last with its samples and `Maps`, from
+        several threads in any order.
     """
-    rows = maps.albedo.shape[0]
-    size = (rows + BLOCKS - 1) // BLOCKS
 
     def visit_block(block):
-        first, last = block * size, min((block + 1) * size, rows)
+        first, last = blocks.span(block)
         if first < last:
+            samples = blocks.block(block)
+            maps = empty_maps((last - first, blocks.grid.shape[1]))
             here = Sums(*(part[block] for part in sums))
             _visit_rows(first, last, samples, pairs, state, scale, loss, maps, here)
+            if keep is not None:
+                keep(first, last, samples, maps)
 
     with ThreadPoolExecutor(get_num_threads()) as threads:
-        list(threads.map(visit_block, range(BLOCKS)))
+        list(threads.map(visit_block, range(blocks.count)))

@@ -67,6 +67,12 @@ def disagreement(samples, shape, exposures=None, hazes=None, shared=None):
     -------
     disagreement : float; NaN when no post is seen twice
     """
+    deviations = deviations_from_mean(samples, shape, exposures, hazes, shared)
+    return nmad(deviations) if deviations.size else float("nan")
+
+
+def deviations_from_mean(samples, shape, exposures=None, hazes=None, shared=None):
+    """The d of `disagreement`, with its arguments: float32 array (n,)."""
     images = len(samples.starts)
     exposures = np.ones(images) if exposures is None else exposures
     hazes = np.zeros(images) if hazes is None else hazes
@@ -82,8 +88,7 @@ def disagreement(samples, shape, exposures=None, hazes=None, shared=None):
         ratio = log_ratio(samples, k, exposures[k], hazes[k], shared)
         deviation = (ratio - mean[_slices(samples.windows[k])]).astype(np.float32)
         deviations.append(deviation[np.isfinite(deviation)])
-    deviations = np.concatenate(deviations)
-    return nmad(deviations) if deviations.size else float("nan")
+    return np.concatenate(deviations)
 
 
 def _slices(window):

@@ -15,7 +15,10 @@ LOSSES = {"least-squares": LEAST_SQUARES, "huber": HUBER, "cauchy": CAUCHY}
 # For functions that only compiled code calls: a third less time to compile. The type stubs of
 # Numba do not know these two options.
 inner = njit(  # type: ignore[call-overload]
-    error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True
+    error_model="numpy",
+    fastmath={"reassoc", "contract", "nsz"},  # sums in vector registers; NaN keeps its meaning
+    no_cpython_wrapper=True,
+    no_cfunc_wrapper=True,
 )
 
 
@@ -30,12 +33,19 @@ def count_row(weight, count, freedom):
 @inner
 def mean_sums(measured, weight, brightness, derivatives, means):
     """Sums of weight, weight times I, times M and times the derivatives of M, along a row."""
+    total, image, model = 0.0, 0.0, 0.0
+    by0, by1, by2, by3 = 0.0, 0.0, 0.0, 0.0
+    d0, d1, d2, d3 = derivatives[0], derivatives[1], derivatives[2], derivatives[3]
     for j in range(measured.size):
-        means[0] += weight[j]
-        means[1] += weight[j] * measured[j]
-        means[2] += weight[j] * brightness[j]
-        for g in range(SHARED):
-            means[3 + g] += weight[j] * derivatives[g, j]
+        total += weight[j]
+        image += weight[j] * measured[j]
+        model += weight[j] * brightness[j]
+        by0 += weight[j] * d0[j]
+        by1 += weight[j] * d1[j]
+        by2 += weight[j] * d2[j]
+        by3 += weight[j] * d3[j]
+    for place, value in enumerate((total, image, model, by0, by1, by2, by3)):
+        means[place] += value
 
 
 @inner
@@ -104,32 +114,51 @@ def weigh_row(
 @inner
 def image_sums(brightness, derivatives, w, albedo, residual, level, own, border, gradient, u):
     """Sums of one image along a row before elimination; ``u`` receives w M J per pixel."""
+    tt, t1, one, rt, r1 = 0.0, 0.0, 0.0, 0.0, 0.0
+    u0, u1 = u[0], u[1]
     for j in range(brightness.size):
         jt = albedo[j] * brightness[j]
         wt, wb = w[j] * jt, w[j] * level
-        own[0, 0] += wt * jt
-        own[0, 1] += wt * level
-        own[1, 1] += wb * level
-        gradient[0] += wt * residual[j]
-        gradient[1] += wb * residual[j]
-        u[0, j] = wt * brightness[j]
-        u[1, j] = wb * brightness[j]
-        for g in range(SHARED):
-            border[0, g] += wt * albedo[j] * derivatives[g, j]
-            border[1, g] += wb * albedo[j] * derivatives[g, j]
+        tt += wt * jt
+        t1 += wt
+        one += w[j]
+        rt += wt * residual[j]
+        r1 += w[j] * residual[j]
+        u0[j] = wt * brightness[j]
+        u1[j] = wb * brightness[j]
+    own[0, 0] += tt
+    own[0, 1] += level * t1
+    own[1, 1] += level * level * one
+    gradient[0] += rt
+    gradient[1] += level * r1
+    for g in range(SHARED):
+        by_exposure, by_haze = 0.0, 0.0
+        derivative = derivatives[g]
+        for j in range(brightness.size):
+            term = w[j] * albedo[j] * derivative[j]
+            by_exposure += term * albedo[j] * brightness[j]
+            by_haze += term
+        border[0, g] += by_exposure
+        border[1, g] += level * by_haze
 
 
 @inner
 def shared_sums(brightness, derivatives, w, albedo, residual, square, gradient, u):
     """Sums of the shared parameters along a row; adds w M J of this image to ``u``."""
     for g in range(SHARED):
+        total = 0.0
+        derivative, out = derivatives[g], u[g]
         for j in range(brightness.size):
-            wg = w[j] * albedo[j] * derivatives[g, j]
-            gradient[g] += wg * residual[j]
-            u[g, j] += wg * brightness[j]
+            wg = w[j] * albedo[j] * derivative[j]
+            total += wg * residual[j]
+            out[j] += wg * brightness[j]
+        gradient[g] += total
         for h in range(g, SHARED):
+            total = 0.0
+            other = derivatives[h]
             for j in range(brightness.size):
-                square[g, h] += w[j] * albedo[j] ** 2 * derivatives[g, j] * derivatives[h, j]
+                total += w[j] * albedo[j] * albedo[j] * derivative[j] * other[j]
+            square[g, h] += total
 
 
 @inner

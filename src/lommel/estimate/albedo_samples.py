@@ -1,37 +1,26 @@
 r"""From observations to the flat arrays that the albedo pass runs over.
 
 For each image: reflectance, phase and the angle off nadir at every post of its window, its mask and
-feathering, and the expected variance of its pixels. Most callers want `collect_samples`.
+feathering, and the expected variance of its pixels. Most callers want `SampleBlocks`.
 """
 
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+from numba import get_num_threads
 
-from lommel.estimate.albedo_arrays import Pairs, Samples
+from lommel.estimate.albedo_arrays import BLOCKS, Pairs, Samples
+from lommel.estimate.albedo_light import ImageGeometry, TerrainPart
 from lommel.scene.geometry import surface_normals, unit, viewing_geometry
 from lommel.scene.grid import Window
-from lommel.scene.masks import pixel_weights, shadow_thresholds
+from lommel.scene.masks import feathering, pixel_weights, shadow_thresholds
 
 ROWS_AT_ONCE = 256  # rows of geometry in memory, 200 bytes per post
-
-
-@dataclass(frozen=True)
-class ImageGeometry:
-    """What the position of Sun and camera decides at the posts of an image's window.
-
-    Attributes
-    ----------
-    cos_incidence, cos_emission : float32 array (rows, cols); NaN where the terrain is unknown
-    phase : float32 array (rows, cols), rad
-    off_axis : float32 array (rows, cols), rad squared
-        Square of the angle between view ray and nadir, at the camera.
-    """
-
-    cos_incidence: np.ndarray
-    cos_emission: np.ndarray
-    phase: np.ndarray
-    off_axis: np.ndarray
+PIXELS_AT_ONCE = 2**22  # of all images in one block of rows, so that a block has 100 MB
+KEPT_PIXELS = 2**26  # of all images whose samples are kept, 1.6 GB
+THIN = 2**22  # pixels that tell the level and the shadow threshold of an image
+STRIP = 32  # rows read together where not all are
+PLANES = Samples._fields[2:]
 
 
 def image_geometry(grid, heights, observation):
@@ -99,14 +88,31 @@ def slope_sensitivity(model, geometry):
 
 
 def collect_samples(observations, grid, heights, model, masks, slope_noise):
-    r"""Flat arrays of all images that can be used, and the reason for each that cannot.
+    """Samples of all images at once; see `SampleBlocks`.
 
-    The expected variance of a pixel is that of the terrain's texture and of its slopes,
+    Returns
+    -------
+    samples : Samples
+    levels : float64 array (used images,), image units
+    reasons : list of str
+        One per observation, empty where it is used.
+    """
+    blocks = SampleBlocks(observations, grid, heights, model, masks, slope_noise)
+    return blocks.rows(0, grid.shape[0]), blocks.levels, blocks.reasons
+
+
+class SampleBlocks:
+    r"""Samples of the images, some rows of the grid at a time.
+
+    What fits in memory is computed once and kept, what does not is computed anew in every pass
+    from the images and the heights: the same numbers either way. The expected variance of a pixel
+    is that of the terrain's texture and of its slopes,
 
     .. math:: \sigma^2 \propto \ell^2 (R^2 + \kappa^2 |\nabla R|^2)
 
     with the image's level :math:`\ell = \sum w I / \sum w R`; images at low Sun, where a small
-    error of slope is a large error of brightness, so get the weight they deserve.
+    error of slope is a large error of brightness, so get the weight they deserve. Images of more
+    than `THIN` pixels tell their level, and the threshold of their shadows, by rows spread evenly.
 
     Parameters
     ----------
@@ -118,40 +124,215 @@ def collect_samples(observations, grid, heights, model, masks, slope_noise):
     slope_noise : float, rad, or None
         :math:`\kappa`, slope error per relative error of brightness; None gives every pixel of
         every image the same variance.
+    kept_pixels : int
+        Pixels of all images up to which samples are kept, 24 bytes each.
+
+    Attributes
+    ----------
+    windows : int64 array (used images, 4)
+    levels, brightness : float64 array (used images,), image units
+        Weighted mean of the used pixels, over that of the reflectance and as it is.
+    reasons : list of str
+        One per observation, empty where it is used.
+    """
+
+    def __init__(
+        self, observations, grid, heights, model, masks, slope_noise, kept_pixels=KEPT_PIXELS
+    ):
+        self.grid, self.heights, self.model = grid, heights, model
+        self.masks, self.slope_noise = masks, slope_noise
+        thin = [_thinned(image.measured) for image in observations]
+        frames = [
+            Frame(image, threshold)
+            for image, threshold in zip(observations, shadow_thresholds(thin, masks), strict=True)
+        ]
+        with ThreadPoolExecutor(get_num_threads()) as threads:
+            found = list(threads.map(self._level, frames))
+        self.reasons = [reason for _, _, reason in found]
+        used = [k for k, reason in enumerate(self.reasons) if not reason]
+        self.levels, self.brightness = np.array([found[k][:2] for k in used]).reshape(-1, 2).T
+        self.frames = [frames[k] for k in used]
+        windows = [(w.row, w.col, w.rows, w.cols) for w in (f.window for f in self.frames)]
+        self.windows = np.array(windows, np.int64).reshape(-1, 4)
+        self.pixels = int(np.sum(self.windows[:, 2] * self.windows[:, 3]))
+        self.count = max(BLOCKS, -(-self.pixels // PIXELS_AT_ONCE))
+        self._kept = {} if self.pixels <= kept_pixels else None
+
+    def span(self, block):
+        """First row of a block, and the row behind its last one."""
+        rows = self.grid.shape[0]
+        size = -(-rows // self.count)
+        return min(block * size, rows), min((block + 1) * size, rows)
+
+    def block(self, block):
+        """Samples of the rows of a block."""
+        if self._kept is None:
+            return self.rows(*self.span(block))
+        if block not in self._kept:
+            self._kept[block] = self.rows(*self.span(block))
+        return self._kept[block]
+
+    def rows(self, first, last):
+        """Samples of the rows from first to before last; only these rows may be asked for.
+
+        Parameters
+        ----------
+        first, last : int
+
+        Returns
+        -------
+        samples : Samples
+        """
+        parts = [rows_of(frame.window, first, last) for frame in self.frames]
+        sizes = [part.rows * part.cols for part in parts]
+        ends = np.cumsum([0, *sizes])
+        planes = np.zeros((len(PLANES), ends[-1]), np.float32)
+        starts = np.zeros(len(parts), np.int64)
+        if ends[-1] > 0:
+            terrain = TerrainPart(
+                self.grid, self.heights, Window(first, 0, last - first, self.grid.shape[1])
+            )
+        for k, (frame, part) in enumerate(zip(self.frames, parts, strict=True)):
+            starts[k] = ends[k] - (part.row - frame.window.row) * part.cols
+            if not part.is_empty:
+                here = planes[:, ends[k] : ends[k + 1]].reshape(len(PLANES), *part.shape)
+                self._fill(here, frame, part, terrain, self.levels[k])
+        return Samples(self.windows, starts, *planes)
+
+    def _fill(self, planes, frame, part, terrain, level):
+        measured, geometry, weight, reflectance, gradient = self._see(frame, part, terrain)
+        precision = _precision(level, reflectance, gradient, self.slope_noise)
+        if self.slope_noise is None:
+            precision[:] = np.float32(1.0 / np.median(self.levels) ** 2)
+        given = (measured, reflectance, geometry.phase, geometry.off_axis, weight, precision)
+        for plane, values in zip(planes, given, strict=True):
+            plane[:] = values
+            plane[np.isnan(plane)] = 0.0
+
+    def _see(self, frame, part, terrain):
+        image = frame.image
+        geometry = terrain.geometry(part, image.sun_position, image.spacecraft_position)
+        measured, weight = frame.weigh(part, geometry, self.masks)
+        reflectance, gradient = slope_sensitivity(self.model, geometry)
+        weight[~(reflectance > 0)] = 0.0
+        return measured, geometry, weight, reflectance, gradient
+
+    def _level(self, frame):
+        """Level and mean brightness of an image, and why it cannot be used, if so."""
+        step = max(1, -(-frame.window.rows * frame.window.cols // THIN))
+        total, value, answer = 0.0, 0.0, 0.0
+        has_ground = has_light = has_value = False
+        for every in {step: None, 1: None}:  # all rows before an image is given up
+            for part in _strips(frame.window, every):
+                terrain = TerrainPart(self.grid, self.heights, part)
+                measured, geometry, weight, reflectance, _ = self._see(frame, part, terrain)
+                total += float(np.sum(weight, dtype=float))
+                value += float(np.sum(weight * np.nan_to_num(measured), dtype=float))
+                answer += float(np.sum(weight * np.nan_to_num(reflectance), dtype=float))
+                known = np.isfinite(measured) & np.isfinite(geometry.cos_incidence)
+                has_ground |= bool(known.any())
+                has_light |= bool((known & (geometry.cos_incidence > 0)).any())
+                has_value |= bool((known & (measured > frame.threshold)).any())
+            if answer > 0:
+                return value / answer, value / total, ""
+        return np.nan, np.nan, _reason(has_ground, has_light, has_value, frame.threshold)
+
+
+class Frame:
+    """An image with what its whole decides about each part: shadow threshold and feathering.
+
+    Parameters
+    ----------
+    image : Observation
+    threshold : float, image units
+    """
+
+    def __init__(self, image, threshold):
+        self.image, self.threshold, self.window = image, float(threshold), image.window
+        rows, cols = image.window.shape
+        in_row, in_col = np.zeros(rows, bool), np.zeros(cols, bool)
+        for first in range(0, rows, ROWS_AT_ONCE):
+            known = np.isfinite(image.measured[first : first + ROWS_AT_ONCE])
+            in_row[first : first + ROWS_AT_ONCE] = known.any(axis=1)
+            in_col |= known.any(axis=0)
+        self.along_rows = feathering((rows, 1), in_row[:, None])
+        self.along_cols = feathering((1, cols), in_col[None, :])
+
+    def weigh(self, part, geometry, masks):
+        """Values and weights of some rows of the image.
+
+        Parameters
+        ----------
+        part : Window
+            All columns of the image.
+        geometry : ImageGeometry
+        masks : MaskSettings
+
+        Returns
+        -------
+        measured, weight : float32 array (part.rows, part.cols)
+        """
+        first = part.row - self.window.row
+        above, below = max(first - 1, 0), min(first + part.rows + 1, self.window.rows)
+        around = ((first - above, below - first - part.rows), (0, 0))
+        inside = slice(first - above, first - above + part.rows)
+        measured = np.asarray(self.image.measured[above:below])
+        usable = pixel_weights(
+            measured,
+            np.pad(geometry.cos_incidence, around, mode="edge"),
+            np.pad(geometry.cos_emission, around, mode="edge"),
+            self.threshold,
+            self.image.saturation,
+            masks,
+        )
+        weight = np.minimum(self.along_rows[first : first + part.rows], self.along_cols)
+        weight[usable[inside] == 0] = 0.0
+        return measured[inside], weight
+
+
+def rows_of(window, first, last):
+    """The part of a window between two rows of the grid; empty parts start inside the window."""
+    top = min(max(window.row, first), window.row + window.rows)
+    bottom = max(min(window.row + window.rows, last), top)
+    return Window(top, window.col, bottom - top, window.cols)
+
+
+def clipped(samples, first, last):
+    """Samples of some rows as a grid of their own.
+
+    Parameters
+    ----------
+    samples : Samples
+        Holding at least these rows.
+    first, last : int
 
     Returns
     -------
     samples : Samples
-    levels : float64 array (used images,), image units
-    reasons : list of str
-        One per observation, empty where it is used.
+        Windows counted from the row ``first``.
     """
-    thresholds = shadow_thresholds([image.measured for image in observations], masks)
-    parts, levels, reasons = [], [], []
-    for observation, threshold in zip(observations, thresholds, strict=True):
-        geometry = image_geometry(grid, heights, observation)
-        weight = pixel_weights(
-            observation.measured,
-            geometry.cos_incidence,
-            geometry.cos_emission,
-            threshold,
-            observation.saturation,
-            masks,
-        )
-        reflectance, gradient = slope_sensitivity(model, geometry)
-        weight = np.where(reflectance > 0, weight, np.float32(0.0))
-        reasons.append("" if weight.any() else _reason(observation, geometry, threshold))
-        if not weight.any():
-            continue
-        level = float(np.sum(weight * np.nan_to_num(observation.measured), dtype=float))
-        level /= float(np.sum(weight * np.nan_to_num(reflectance), dtype=float))
-        levels.append(level)
-        precision = _precision(level, reflectance, gradient, slope_noise)
-        parts.append((observation, geometry, reflectance, weight, precision))
-    if slope_noise is None and parts:
-        common = np.float32(1.0 / np.median(levels) ** 2)
-        parts = [(*part[:4], np.full_like(part[4], common)) for part in parts]
-    return _concatenate(parts), np.array(levels), reasons
+    windows, starts = samples.windows.copy(), samples.starts.copy()
+    for k, (row, col, rows, cols) in enumerate(samples.windows):
+        part = rows_of(Window(row, col, rows, cols), first, last)
+        starts[k] = samples.starts[k] + (part.row - row) * cols if part.rows else 0
+        windows[k] = part.row - first if part.rows else 0, col, part.rows, cols
+    return samples._replace(windows=windows, starts=starts)
+
+
+def _thinned(measured):
+    """At most about `THIN` pixels of an image, rows spread evenly."""
+    step = max(1, -(-measured.shape[0] * measured.shape[1] // THIN))
+    if step == 1:
+        return np.asarray(measured)
+    return np.concatenate([np.asarray(measured[row]) for row in range(0, len(measured), step)])
+
+
+def _strips(window, every):
+    """Parts of a window that hold every so-many-th group of `STRIP` rows."""
+    height = ROWS_AT_ONCE if every == 1 else STRIP
+    for first in range(0, window.rows, height * every):
+        rows = min(height, window.rows - first)
+        yield Window(window.row + first, window.col, rows, window.cols)
 
 
 def _precision(level, reflectance, gradient, slope_noise):
@@ -161,46 +342,18 @@ def _precision(level, reflectance, gradient, slope_noise):
     return 1.0 / np.maximum(variance, 1e-6 * level**2)
 
 
-def _reason(observation, geometry, threshold):
+def _reason(has_ground, has_light, has_value, threshold):
     """Why no pixel of an image is used."""
-    known = np.isfinite(observation.measured) & np.isfinite(geometry.cos_incidence)
-    if not known.any():
+    if not has_ground:
         return "no pixel lies on known terrain"
-    if not (known & (geometry.cos_incidence > 0)).any():
+    if not has_light:
         return "the Sun is below the horizon everywhere"
-    if not (known & (observation.measured > threshold)).any():
+    if not has_value:
         return (
             f"every pixel is shadow: no value above shadow_threshold = {threshold:.4g}; "
             "set a lower one if the image is lit"
         )
     return "every pixel is shadow, saturated or seen or lit too obliquely"
-
-
-def _concatenate(parts):
-    """Samples of the images, pixels without use set to 0."""
-    windows = np.array(
-        [
-            [getattr(part[0].window, name) for name in ("row", "col", "rows", "cols")]
-            for part in parts
-        ],
-        dtype=np.int64,
-    ).reshape(-1, 4)
-    sizes = windows[:, 2] * windows[:, 3]
-
-    def flat(planes):
-        known = [np.nan_to_num(plane.astype(np.float32), nan=0.0).ravel() for plane in planes]
-        return np.concatenate(known) if known else np.zeros(0, np.float32)
-
-    return Samples(
-        windows=windows,
-        starts=np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64),
-        measured=flat([part[0].measured for part in parts]),
-        reflectance=flat([part[2] for part in parts]),
-        phase=flat([part[1].phase for part in parts]),
-        off_axis=flat([part[1].off_axis for part in parts]),
-        weight=flat([part[3] for part in parts]),
-        precision=flat([part[4] for part in parts]),
-    )
 
 
 def overlapping_pairs(windows):
