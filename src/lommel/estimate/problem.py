@@ -234,6 +234,21 @@ class Problem:
         self.masses = np.zeros(1)
         self.slope = np.zeros(2, np.float32)
 
+    def hold(self, posts, weight):
+        """Hold posts at given values, besides those that are pinned already.
+
+        Parameters
+        ----------
+        posts : float32 array (rows, cols), m
+        weight : float32 array (rows, cols), 1/m^2
+        """
+        if self.pins is None:
+            self.pins, self.pinned = weight, posts
+            return
+        total = self.pins + weight
+        values = self.pins * self.pinned + weight * posts
+        self.pins, self.pinned = total, values / np.where(total > 0, total, np.float32(1))
+
     def prior_gradient(self, u):
         """Gradient of the prior terms at ``u``, and their cost."""
         cols = u.shape[1]

@@ -32,7 +32,7 @@ from lommel.estimate.albedo_field import (
     observed_contrast,
 )
 from lommel.estimate.priors import Priors, PriorSettings, estimate_priors
-from lommel.estimate.problem import best_photometry, exposure_gain, fresh_problem
+from lommel.estimate.problem import best_photometry, coarse_posts, exposure_gain, fresh_problem
 from lommel.estimate.shading_kernels import SUM_COUNT, SUM_RR
 
 COARSEST = 24  # posts along the shorter side of the coarsest level that sees the images
@@ -126,6 +126,29 @@ class SurfaceSolution:
     priors: Priors
 
 
+@dataclass(frozen=True)
+class Start:
+    """A surface known from a coarser grid: the solver starts from it instead of from the DEM.
+
+    Attributes
+    ----------
+    u : float32 array (rows, cols), m
+        Unknowns at the posts.
+    stride : int
+        Posts per post of the coarser grid.
+    hold : float32 array (rows, cols), 1/m^2
+        Weight with which each post is held there: along the rim of a part of a larger scene.
+    misfits : array (images,), dimensionless
+        Residuals that the whole scene leaves, in noise standard errors: they tell, for all its
+        parts alike, whether there is something left for albedo.
+    """
+
+    u: np.ndarray
+    stride: int
+    hold: np.ndarray
+    misfits: np.ndarray
+
+
 def solve_surface(
     surface,
     initial,
@@ -136,6 +159,7 @@ def solve_surface(
     albedo=None,
     photometry=None,
     measured=None,
+    start=None,
 ):
     """Refine a surface by the shading in images.
 
@@ -155,6 +179,7 @@ def solve_surface(
         Known exposures and hazes, held fixed.
     measured : bool array (rows, cols), optional
         Posts that were measured, the others being interpolated; all of them by default.
+    start : Start, optional
 
     Returns
     -------
@@ -188,18 +213,21 @@ def solve_surface(
         finest.pin(measured, priors.roughness * spacing)
         if settings.estimate_haze is None:
             settings = replace(settings, estimate_haze=settings.estimate_exposure)
+    if start is not None:
+        finest.hold(start.u, start.hold)
     correlations = [
         correlation(cells, finest.predict(finest.initial, k))
         for k, cells in enumerate(finest.cells)
     ]
     history: list[dict] = []
-    u, converged = _coarse_to_fine(finest, settings, history)
+    u, converged = _coarse_to_fine(finest, settings, history, start)
     if measured is not None and settings.estimate_albedo:
         u, converged = _part_albedo(finest, u, priors, settings, history)
     sums = finest.assemble(u)[2]
     misfits = np.sqrt(sums[:, SUM_RR] / np.maximum(sums[:, SUM_COUNT], 1))
-    if settings.estimate_albedo and misfits.max() > EXPLAINED:
-        _fit_albedo(finest, u, priors, misfits, settings)
+    left = misfits if start is None else start.misfits
+    if settings.estimate_albedo and left.max() > EXPLAINED:
+        _fit_albedo(finest, u, priors, left, settings)
     modelled = [finest.predict(u, k) for k in range(len(views))]
     value = SurfaceSolution(
         u,
@@ -252,12 +280,18 @@ def correlation(measured, modelled):
     return float(np.corrcoef(pair)[0, 1])
 
 
-def _coarse_to_fine(finest, settings, history):
+def _coarse_to_fine(finest, settings, history, start=None):
     """Solve on ever finer grids, each starting from the correction found on the last."""
     levels = [finest]
-    while min(levels[-1].initial.shape) >= 2 * COARSEST:
+    known = np.inf if start is None else start.stride  # this level and coarser ones are solved
+    while min(levels[-1].initial.shape) >= 2 * COARSEST and 2 * levels[-1].stride < known:
         levels.append(levels[-1].coarser())
     u, converged = levels[-1].initial, False
+    if start is not None:
+        correction = start.u - finest.initial
+        for _ in levels[1:]:
+            correction = coarse_posts(correction)
+        u = u + correction
     for depth in range(len(levels) - 1, -1, -1):
         level = levels[depth]
         if depth < len(levels) - 1:
