@@ -33,6 +33,7 @@ DOWNSAMPLING = 1.5  # input pixels per post from which area means replace interp
 CLIPPED_8_BIT = (0.0, 255.0)  # image values that only say "at most" and "at least"
 GDAL_ERRORS = (RasterioError, CPLE_BaseError, OSError, ValueError)  # rasterio mixes them
 SPECIAL = 1e38  # ISIS marks missing pixels by values beyond it, double nodata is cut down to it
+PIXELS_AT_ONCE = 2**25  # of a raster held to make a smaller one: 128 MiB
 BLOCK = 512  # pixels along each side of a GeoTIFF's tiles
 WRITING_SPACE = 2.4  # of a raster's plain size, while it is written: itself, overviews, the copy
 COG = {
@@ -223,6 +224,12 @@ def read_on_grid(path, grid, body=MOON, interpolation=Resampling.cubic, unknown=
     part = _needed_part(source, grid)
     if part.is_empty:
         return np.full(grid.shape, np.nan, np.float32)
+    is_large = part.rows * part.cols > max(PIXELS_AT_ONCE, 4 * grid.shape[0] * grid.shape[1])
+    if is_large and grid.shape[0] > 1:  # much is read for few means: by halves
+        top = Window(0, 0, grid.shape[0] // 2, grid.shape[1])
+        low = Window(top.rows, 0, grid.shape[0] - top.rows, grid.shape[1])
+        halves = (grid.cut(half) for half in (top, low))
+        return np.concatenate([read_on_grid(path, h, body, interpolation, unknown) for h in halves])
     values, source = read_pixels(path, part), source.cut(part)
     values[np.isin(values, unknown)] = np.nan
     if source.is_same(grid):

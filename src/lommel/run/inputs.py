@@ -18,6 +18,7 @@ from lommel.scene.geometry import Observation
 from lommel.scene.grid import Grid, Window, bounds_in, grid_from_bounds, read_crs
 
 POST_LIMIT = 2**30  # posts of the products: 4 GiB for every float32 array of them
+POSTS_AT_ONCE = 2**24  # of the terrain while it is read, 30 bytes each
 RADIUS_FROM = 0.5  # of the body's radius; no height comes near it
 DEM_IS_FINE_ENOUGH = 1.5  # image pixels per DEM post up to which the DEM's own grid is kept
 
@@ -100,23 +101,27 @@ class Scene:
     skipped: list[Skipped]
 
 
-def read_scene(files, grid_settings=None, prefer="images", body=MOON, progress=iter):
+def read_scene(files, grid_settings=None, prefer="images", body=MOON, progress=iter, store=None):
     """Terrain and images on one grid.
 
     Parameters
     ----------
     files : SceneFiles
-    grid_settings : GridSettings, optional
+    grid_settings : GridSettings or Grid, optional
+        A grid is taken as it is.
     prefer : {'images', 'dem'}
         Whose posts the automatic grid takes over.
     body : Body
     progress : callable
         Wraps the iterable of images, as ``rich.progress.track`` does.
+    store : function (observation), optional
+        Gives each observation back when it is read, its image perhaps stored elsewhere.
 
     Returns
     -------
     scene : Scene
     """
+    store = store or _as_it_is
     refuse_duplicates(files.images)
     if not files.dems:
         raise InputError("No DEM given. Name at least one with --dem.")
@@ -133,7 +138,8 @@ def read_scene(files, grid_settings=None, prefer="images", body=MOON, progress=i
     observations = []
     for path in progress(list(image_grids)):
         try:
-            observations.append(observe(path, image_grids[path], grid, heights, tables, body))
+            seen = observe(path, image_grids[path], grid, heights, tables, body)
+            observations.append(store(seen))
         except LommelError as error:
             skipped.append(Skipped(path.name, str(error)))
     if not observations:
@@ -151,7 +157,8 @@ def choose_grid(image_grids, dem_grids, settings, prefer="images", body=MOON):
     Parameters
     ----------
     image_grids, dem_grids : list of Grid
-    settings : GridSettings
+    settings : GridSettings or Grid
+        A grid is taken as it is.
     prefer : {'images', 'dem'}
     body : Body
 
@@ -159,6 +166,8 @@ def choose_grid(image_grids, dem_grids, settings, prefer="images", body=MOON):
     -------
     grid : Grid
     """
+    if isinstance(settings, Grid):
+        return settings
     preferred = dem_grids[0] if prefer == "dem" else image_grids[0]
     crs = read_crs(settings.crs, body, "--crs") if settings.crs else preferred.crs
     gsd = float(np.median([max(grid.spacing) for grid in image_grids]))
@@ -216,6 +225,15 @@ def known_heights(paths, grid, body=MOON):
     -------
     heights : float32 array (rows, cols), m; NaN where no DEM knows
     """
+    rows = max(1, POSTS_AT_ONCE // grid.shape[1])
+    heights = np.empty(grid.shape, np.float32)
+    for first in range(0, grid.shape[0], rows):
+        part = Window(first, 0, min(rows, grid.shape[0] - first), grid.shape[1])
+        heights[part.slices] = _mean_heights(paths, grid.cut(part), body)
+    return heights
+
+
+def _mean_heights(paths, grid, body):
     total = np.zeros(grid.shape)
     count = np.zeros(grid.shape, np.int16)
     for path in paths:
@@ -229,6 +247,10 @@ def known_heights(paths, grid, body=MOON):
         total[window.slices] += np.where(known, part, 0.0)
         count[window.slices] += known
     return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
+
+
+def _as_it_is(observation):
+    return observation
 
 
 def place_images(paths, dem_grids, body):

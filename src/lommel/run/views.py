@@ -16,7 +16,9 @@ from lommel.run.inputs import (
     DEM_IS_FINE_ENOUGH,
     GridSettings,
     Skipped,
+    choose_grid,
     listing,
+    place_images,
     read_heights,
     read_scene,
     refuse_duplicates,
@@ -24,12 +26,15 @@ from lommel.run.inputs import (
 )
 from lommel.scene.body import MOON, to_xyz
 from lommel.scene.camera import ReducedCamera
-from lommel.scene.grid import Grid, bounds_in, grid_from_bounds, read_crs
+from lommel.scene.grid import Grid, Window, bounds_in, grid_from_bounds, read_crs
 from lommel.scene.masks import CLIPPED, MARGIN, MaskSettings, shadow_thresholds, widened
+from lommel.scene.ortho import needed_pixels
 from lommel.scene.view import CameraView, OrthoView
 
 LEAST_SHARED = 8  # rows and columns of posts; a thinner sliver of an image tells no slope apart
 SIGHTS = 65  # posts along each side that are tried to see whether a camera sees the DEM
+PIXELS_AT_ONCE = 2**23  # of an image read for their means: 32 MiB
+EDGE = 8  # pixels read around those that show the ground: slopes and relief move points
 LEAST_LIT = 0.01  # share of an image's pixels that must be lit and unclipped for it to be used
 
 
@@ -45,25 +50,32 @@ class ViewedTerrain:
     views : list of OrthoView or CameraView
         Shadow and clipped pixels are NaN.
     skipped : list of Skipped
+    thresholds : dict of str to float, image units
+        Shadow threshold of each image by its name.
     """
 
     grid: Grid
     heights: np.ndarray
     views: list
     skipped: list[Skipped]
+    thresholds: dict[str, float]
 
 
-def read_views(files, grid_settings=None, masks=None, body=MOON, progress=iter):
+def read_views(files, grid_settings=None, masks=None, body=MOON, progress=iter, thresholds=None):
     """Terrain and images for shape from shading.
 
     Parameters
     ----------
     files : SceneFiles
-    grid_settings : GridSettings, optional
+    grid_settings : GridSettings or Grid, optional
+        A grid is taken as it is.
     masks : MaskSettings, optional
     body : Body
     progress : callable
         Wraps the iterable of images, as ``rich.progress.track`` does.
+    thresholds : dict of str to float, image units, optional
+        Shadow thresholds found on the whole scene, of which the grid is a part: of raw images
+        only what falls on it is read.
 
     Returns
     -------
@@ -89,16 +101,54 @@ def read_views(files, grid_settings=None, masks=None, body=MOON, progress=iter):
     suns = _sun_table(files, body) if cameras else None
     for path in progress(list(cameras)) if cameras else ():
         try:
-            views.append(_camera_view(path, cameras[path], suns, files, grid, heights, body))
+            views.append(
+                _camera_view(
+                    path, cameras[path], suns, files, grid, heights, body, thresholds is not None
+                )
+            )
         except LommelError as error:
             skipped.append(Skipped(path.name, str(error)))
     order = {path.name: number for number, path in enumerate(files.images)}
     views.sort(key=lambda pair: order[pair[0].name])
-    usable, unusable = mask_views(views, masks or MaskSettings())
+    if thresholds is None:
+        found = shadow_thresholds([view.image for view, _ in views], masks or MaskSettings())
+        names = (view.name for view, _ in views)
+        thresholds = dict(zip(names, found.tolist(), strict=True))
+    usable, unusable = mask_views(views, thresholds)
     skipped += unusable
     if not usable:
         raise InputError("No image can be used.\n" + listing(skipped))
-    return ViewedTerrain(grid, heights, usable, skipped)
+    return ViewedTerrain(grid, heights, usable, skipped, thresholds)
+
+
+def view_grid(files, grid_settings=None, body=MOON):
+    """The grid that `read_views` would choose, from the headers of the files alone.
+
+    Parameters
+    ----------
+    files : SceneFiles
+    grid_settings : GridSettings, optional
+    body : Body
+
+    Returns
+    -------
+    grid : Grid
+    """
+    refuse_duplicates(files.images)
+    settings = grid_settings or GridSettings()
+    cameras = _camera_files(files)
+    flat = [path for path in files.images if path not in cameras]
+    if not flat:
+        return _terrain_grid(files.dems, cameras, settings, body)
+    if not files.dems:
+        raise InputError("No DEM given. Name at least one with --dem.")
+    dem_grids = [read_grid(path, body) for path in files.dems]
+    image_grids, skipped = place_images(flat, dem_grids, body)
+    if not image_grids:
+        raise InputError("No image can be used.\n" + listing(skipped))
+    grid = choose_grid(list(image_grids.values()), dem_grids, settings, "dem", body)
+    refuse_unusable(grid)
+    return grid
 
 
 def _sliver(observation):
@@ -110,14 +160,15 @@ def _sliver(observation):
     )
 
 
-def mask_views(views, settings):
+def mask_views(views, thresholds):
     """Blank shadow and clipped pixels; an image that keeps too little is left out.
 
     Parameters
     ----------
     views : list of (OrthoView or CameraView, float)
         Each with the value at which its image clips.
-    settings : MaskSettings
+    thresholds : dict of str to float, image units
+        Image value up to which a pixel is shadow, by the image's name.
 
     Returns
     -------
@@ -125,8 +176,8 @@ def mask_views(views, settings):
     skipped : list of Skipped
     """
     usable, skipped = [], []
-    thresholds = shadow_thresholds([view.image for view, _ in views], settings)
-    for (view, saturation), threshold in zip(views, thresholds, strict=True):
+    for view, saturation in views:
+        threshold = thresholds[view.name]
         is_used = (view.image > threshold) & (view.image < CLIPPED * saturation)
         # what lies beside shadow, clipping or no data holds part of it: read as slope, a scarp
         is_used = ~widened(~is_used, MARGIN)
@@ -155,6 +206,8 @@ def _camera_files(files):
 
 def _terrain_grid(dems, cameras, settings, body):
     """The DEM's own posts, unless told otherwise or coarser than the images."""
+    if isinstance(settings, Grid):
+        return settings
     if not dems:
         raise InputError("No DEM given. Name at least one with --dem.")
     grids = [read_grid(path, body) for path in dems]
@@ -206,15 +259,16 @@ def ground_sample_distance(camera, grid, height):
     return (grid.spacing[0] * grid.spacing[1]) ** 0.5 / pixels if pixels > 0 else np.nan
 
 
-def _camera_view(path, camera_path, suns, files, grid, heights, body):
-    image = read_pixels(path)
-    camera = read_camera(camera_path, image.shape)
+def _camera_view(path, camera_path, suns, files, grid, heights, body, is_part):
+    info = raster_info(path, body)
+    camera = read_camera(camera_path, info.shape)
     height = float(np.nanmean(heights, dtype=float))
     posts = (
         np.linspace(0, grid.shape[0] - 1, SIGHTS)[:, None],
         np.linspace(0, grid.shape[1] - 1, SIGHTS),
     )
-    line, sample = camera.project(to_xyz(body, *grid.lonlat_at(*posts), height))
+    at_posts = grid.lonlat_at(*posts)
+    line, sample = camera.project(to_xyz(body, *at_posts, height))
     if not camera.contains(line, sample).any():
         raise GeometryError(
             f"{path.name}: its camera does not see the DEM. Check that camera and DEM belong to "
@@ -222,8 +276,16 @@ def _camera_view(path, camera_path, suns, files, grid, heights, body):
         )
     gsd = ground_sample_distance(camera, grid, height)
     factor = int(min(grid.spacing) / gsd + 0.5) if np.isfinite(gsd) else 1
+    window = Window(0, 0, *info.shape)
+    if is_part:
+        ends = [
+            camera.project(to_xyz(body, *at_posts, end))
+            for end in (np.nanmin(heights), np.nanmax(heights))
+        ]
+        window = _shown_part(ends, info.shape)
+    image, first = _read_reduced(path, window, factor)
     if factor > 1:  # finer pixels than posts: their means are what the cells can explain
-        image, camera = _reduce(image, factor), ReducedCamera(camera, factor)
+        camera = ReducedCamera(camera, factor)
     sun = camera.sun_position
     if sun is None and suns is None:
         raise InputError(
@@ -232,12 +294,42 @@ def _camera_view(path, camera_path, suns, files, grid, heights, body):
         )
     if sun is None:
         sun = find_position(suns, path.name, files.sun_positions)
-    return CameraView(path.name, image, camera, sun), raster_info(path, body).saturation
+    return CameraView(path.name, image, camera, sun, first), info.saturation
+
+
+def _shown_part(ends, shape):
+    """The part of an image that shows ground, from a lattice at its least and its most height."""
+    line, sample = (np.stack(coordinates) for coordinates in zip(*ends, strict=True))
+    steps = [
+        np.nanmax(np.abs(np.diff(x, axis=k)), initial=0) for x in (line, sample) for k in (1, 2)
+    ]
+    window = needed_pixels(line, sample, shape, int(max(steps)) + EDGE)
+    if window.is_empty:
+        raise GeometryError("The image does not show this part of the terrain.")
+    return window
+
+
+def _read_reduced(path, window, factor):
+    """Means over squares of pixels, read some lines at a time, and the first one's place."""
+    line, sample = window.row // factor, window.col // factor
+    lines = (window.row + window.rows) // factor - line
+    samples = (window.col + window.cols) // factor - sample
+    image = np.empty((lines, samples), np.float32)
+    at_once = max(PIXELS_AT_ONCE // (samples * factor**2), 1)
+    for begin in range(0, lines, at_once):
+        strip = image[begin : begin + at_once]
+        part = Window(
+            (line + begin) * factor, sample * factor, strip.shape[0] * factor, samples * factor
+        )
+        strip[:] = _reduce(read_pixels(path, part), factor)
+    return image, (line, sample)
 
 
 def _reduce(image, factor):
+    if factor == 1:
+        return image
     lines, samples = (size // factor for size in image.shape)
-    squares = image[: lines * factor, : samples * factor].reshape(lines, factor, samples, factor)
+    squares = image.reshape(lines, factor, samples, factor)
     return squares.mean(axis=(1, 3), dtype=np.float32)
 
 

@@ -90,12 +90,15 @@ class CameraView:
     image : float32 array (lines, samples)
     camera : Camera
     sun_position : array (3,), m, body-fixed
+    first : tuple of int
+        Line and sample of the array's first pixel, where it holds a part of the image.
     """
 
     name: str
     image: np.ndarray
     camera: Camera
     sun_position: np.ndarray
+    first: tuple[int, int] = (0, 0)
 
     @property
     def is_projected(self):
@@ -120,5 +123,6 @@ class CameraView:
         at_zero = (
             (at_low + at_high) / 2 - per_metre * u - 0.5
         )  # array index of the first centre is 0
+        at_zero -= np.array(self.first)[:, None, None]
         planes = np.concatenate([at_zero, per_metre, np.zeros_like(at_zero)])
         return planes.astype(np.float32)
