@@ -5,8 +5,8 @@ done, 1: a stage failed, 2: the request was wrong. Stages are imported when they
 ``lommel --help`` answers at once.
 """
 
-import json
 import gc
+import json
 import math
 import signal
 import sys
@@ -206,6 +206,19 @@ def sfs(
     spacing: Spacing = None,
     crs: Crs = None,
     bounds: Bounds = None,
+    memory: Annotated[
+        str | None,
+        typer.Option(
+            help="What the run may take, like 8GB; a scene that needs more is solved in tiles. "
+            "Default: 60 % of what is free."
+        ),
+    ] = None,
+    engine: Annotated[
+        str, typer.Option(help="Tiles one after the other (serial), or in processes.")
+    ] = "serial",
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show tiles, memory, disk and time; solve nothing.")
+    ] = False,
     report: Annotated[bool, typer.Option(help="Also draw report.html (3 s).")] = False,
     overwrite: Overwrite = False,
 ):
@@ -213,6 +226,7 @@ def sfs(
     from lommel.estimate.priors import PriorSettings
     from lommel.estimate.shape_from_shading import SolverSettings
     from lommel.run.shape_from_shading import SfsSettings, run_shape_from_shading
+    from lommel.run.tiles_plan import Tiling, plan_tiles, read_memory
     from lommel.scene.masks import MaskSettings
 
     settings = SfsSettings(
@@ -236,8 +250,12 @@ def sfs(
     )
     files = _files(images, dem, sun_positions, spacecraft_positions, positions_unit, cameras)
     grid = _grid(spacing, crs, bounds)
-    with _progress("Reading images") as progress:
-        run_shape_from_shading(files, output, settings, grid, overwrite, progress)
+    tiling = Tiling(None if memory is None else read_memory(memory), engine)
+    if dry_run:
+        typer.echo(plan_tiles(files, grid, tiling, output))
+        return
+    with _progress("Images, tiles") as progress:
+        run_shape_from_shading(files, output, settings, grid, overwrite, progress, tiling)
     _finish(output, report)
 
 

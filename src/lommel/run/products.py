@@ -140,7 +140,7 @@ class RunRecord:
         start = time.perf_counter()
         yield
         seconds = time.perf_counter() - start
-        peak = _peak_memory_mb()
+        peak = peak_memory_mb()
         self.stages.append(
             {"name": name, "seconds": round(seconds, 3), "peak_memory_mb": round(peak, 1)}
         )
@@ -168,7 +168,7 @@ class RunRecord:
         (Path(folder) / "run.json").write_text(text + "\n", encoding="utf-8")
 
 
-def _peak_memory_mb():
+def peak_memory_mb():
     """Largest resident size of this process so far.
 
     From the kernel's own mark where there is one: the portable figure is inherited from the

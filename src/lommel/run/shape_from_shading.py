@@ -23,6 +23,7 @@ from lommel.io.raster import write_raster
 from lommel.run.inputs import GridSettings, SceneFiles
 from lommel.run.photometry import read_known
 from lommel.run.products import RunRecord, output_folder
+from lommel.run.tiles_plan import plan_tiles
 from lommel.run.views import read_views
 from lommel.scene.grid import Grid
 from lommel.scene.masks import MaskSettings
@@ -70,8 +71,11 @@ def run_shape_from_shading(
     grid_settings: GridSettings | None = None,
     overwrite: bool = False,
     progress=iter,
+    tiling=None,
 ):
     """Refine a DEM by the shading in images and write the products.
+
+    A scene that does not fit in memory is solved in tiles (`lommel.run.tiles`).
 
     Parameters
     ----------
@@ -83,6 +87,8 @@ def run_shape_from_shading(
     overwrite : bool
     progress : callable
         Wraps the iterable of images.
+    tiling : Tiling, optional
+        Memory, engine and size of tiles.
 
     Returns
     -------
@@ -99,6 +105,12 @@ def run_shape_from_shading(
     with output_folder(output, overwrite) as folder:
         with record.stage("read"):
             settled, lost, remark = _settled(files, folder, settings.registers)
+            if plan_tiles(settled, grid_settings, tiling, output).is_tiled:
+                from lommel.run.tiles import run_tiles  # and what it needs to share work
+
+                return run_tiles(
+                    files, settled, lost, folder, output, settings, grid_settings, tiling, progress
+                )
             scene = read_views(settled, grid_settings, settings.masks, progress=progress)
             record.add_inputs([*files.images, *files.dems])
             tables = (files.sun_positions, files.spacecraft_positions)
@@ -132,13 +144,13 @@ def run_shape_from_shading(
             remark = _doubt(files, scene.views, solution.value.correlations, folder)
         with record.stage("write"):
             refined = surface.heights_from_posts(solution.value.u)
-            seen = _seen_posts(solution.value.measured)
+            seen = seen_posts(solution.value.measured)
             if measured is not None:
                 refined = faded(refined, scene.heights, seen)
             refined[~(known | seen)] = np.nan
             residual = relative_residual(solution.value)
             _write_products(folder, scene, initial, refined, solution.value, residual)
-            _write_exposures(folder, scene.views, record.skipped, solution.value)
+            write_exposures(folder, scene.views, record.skipped, solution.value)
         record.results = _results(scene, refined, solution.value, residual)
         record.history = solution.history
         record.outcome = {"name": solution.outcome, "sentence": solution.advice + remark}
@@ -183,7 +195,7 @@ def _surface(grid, heights, first, parametrisation):
     return Surface(grid, float(np.mean(heights, dtype=float)), camera)
 
 
-def _seen_posts(images):
+def seen_posts(images):
     """Posts whose four cells some image sees."""
     seen = np.any([np.isfinite(image) for image in images], axis=0)
     padded = np.pad(seen, 1, mode="edge")
@@ -289,7 +301,19 @@ def relative_residual(surface):
     return np.sqrt(total / np.where(count > 0, count, np.nan).astype(np.float32))
 
 
-def _write_exposures(folder, views, skipped, surface):
+def write_exposures(folder, views, skipped, surface):
+    """Write ``exposures.csv``: a line per image, and the reasons of those left out.
+
+    Parameters
+    ----------
+    folder : Path
+    views : list
+        Of objects with a ``name``.
+    skipped : list of dict
+        Of the run's record.
+    surface : SurfaceSolution
+        Or another object with ``exposures``, ``hazes`` and ``misfits``.
+    """
     with open(folder / "exposures.csv", "w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["image", "exposure", "haze", "residual_sigma", "used", "reason"])

@@ -1,0 +1,323 @@
+"""How a scene that does not fit in memory is cut: tiles, halos, and the coarse grid before them.
+
+Most callers want `make_plan`.
+"""
+
+import json
+import math
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from affine import Affine
+
+from lommel.errors import InputError
+from lommel.run.views import view_grid
+from lommel.scene.grid import Grid, Window
+
+BYTES_PER_POST, BYTES_PER_IMAGE = 200, 16  # measured: 211 with one image, 235 with four
+AT_REST = 300e6  # bytes of a process with its modules and compiled code
+MEMORY_SHARE = 0.6  # of what is free now: a safe share, others work here as well
+ENGINES = ("serial", "processes")
+HALO = 128  # posts beside a tile that are solved along
+BLEND = 64  # posts over which a tile goes over into the next
+STEP = 128  # posts; tiles begin at multiples of it, so that coarse levels have the same posts
+LEAST_SIDE = 256  # posts; smaller tiles would be mostly halo
+SECONDS_PER_POST = 1.3e-6  # and image set, on two cores
+DISK_PER_POST = 9 * 4 * 3.4  # bytes: nine products in the tiles, as scratch, and compressed
+UNITS = {"": 1.0, "KB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """How a large scene is to be cut and worked on.
+
+    Attributes
+    ----------
+    memory : float, bytes, or None
+        Of the whole run; None takes a safe share of what is free.
+    engine : {'serial', 'processes'}
+    side : int, posts, or None
+        Of a tile without its halo; None takes what fits in memory.
+    """
+
+    memory: float | None = None
+    engine: str = "serial"
+    side: int | None = None
+
+    def __post_init__(self):
+        """Refuse an engine that is not known."""
+        if self.engine not in ENGINES:
+            raise InputError(
+                f"engine = {self.engine!r} is not known. Choose {' or '.join(ENGINES)}."
+            )
+
+    @property
+    def workers(self):
+        """Processes at work at a time."""
+        return 1 if self.engine == "serial" else os.cpu_count() or 1
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A part of the scene.
+
+    Attributes
+    ----------
+    number : int
+    inner : Window
+        Posts that only this tile writes before blending.
+    outer : Window
+        With its halo: what is read and solved.
+    """
+
+    number: int
+    inner: Window
+    outer: Window
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a scene is cut.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        Posts of the scene.
+    images : int
+    stride : int
+        Posts of the scene per post of the coarse grid that is solved first.
+    tiles : tuple of Tile
+    memory : float, bytes
+        What one process takes at most.
+    """
+
+    shape: tuple[int, int]
+    images: int
+    stride: int
+    tiles: tuple[Tile, ...]
+    memory: float
+
+    @property
+    def is_tiled(self):
+        """False when one tile is all."""
+        return len(self.tiles) > 1
+
+    @property
+    def side(self):
+        """Posts along a tile without its halo."""
+        return max(self.tiles[0].inner.shape)
+
+    @property
+    def posts(self):
+        """Posts solved at full resolution, halos included."""
+        return sum(tile.outer.rows * tile.outer.cols for tile in self.tiles)
+
+    @property
+    def seconds(self):
+        """Estimated time on two cores."""
+        return SECONDS_PER_POST * (self.posts + self.shape[0] * self.shape[1] / self.stride**2)
+
+    @property
+    def disk(self):
+        """Bytes of disk while the run lasts, at most."""
+        return DISK_PER_POST * self.shape[0] * self.shape[1]
+
+    def __str__(self):
+        """Lines for people: tiles, memory, disk, time."""
+        largest = max(tile.outer.rows * tile.outer.cols for tile in self.tiles)
+        side = largest**0.5
+        return (
+            f"posts    {self.shape[0]} x {self.shape[1]}, {self.images} images\n"
+            f"tiles    {len(self.tiles)}, the largest of about {side:.0f} x {side:.0f} posts"
+            + (f"; before them every {self.stride}th post at once\n" if self.stride > 1 else "\n")
+            + f"memory   {self.memory / 1e9:.2f} GB\n"
+            f"disk     {self.disk / 1e9:.2f} GB at most while it runs\n"
+            f"time     about {max(self.seconds / 60, 0.1):.1f} min on two cores"
+        )
+
+
+def make_plan(shape, images, memory, side=None):
+    """Tiles of a scene that stay within memory; one tile when all of it does.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Posts of the scene.
+    images : int
+    memory : float, bytes
+        Of one process.
+    side : int, posts, optional
+        Of a tile without its halo, in place of what follows from memory; a multiple of `STEP`.
+
+    Returns
+    -------
+    plan : Plan
+    """
+    per_post = BYTES_PER_POST + BYTES_PER_IMAGE * images
+    posts = (memory - AT_REST) / per_post
+    rows, cols = shape
+    if side is None and rows * cols <= posts:
+        whole = Window(0, 0, rows, cols)
+        return Plan(shape, images, 1, (Tile(0, whole, whole),), AT_REST + rows * cols * per_post)
+    if side is None:
+        side = int(max(posts, 0) ** 0.5 - 2 * HALO) // STEP * STEP
+    if side < min(LEAST_SIDE, STEP):
+        least = AT_REST + per_post * (LEAST_SIDE + 2 * HALO) ** 2
+        raise InputError(
+            f"--memory {memory / 1e9:.2f} GB is too little for {images} images: a tile of "
+            f"{LEAST_SIDE} posts needs {least / 1e9:.2f} GB. Give more, or fewer images."
+        )
+    tiles = []
+    for row, last_row in _cuts(rows, side):
+        for col, last_col in _cuts(cols, side):
+            inner = Window(row, col, last_row - row, last_col - col)
+            around = Window(row - HALO, col - HALO, inner.rows + 2 * HALO, inner.cols + 2 * HALO)
+            outer = around.intersection(Window(0, 0, rows, cols))
+            tiles.append(Tile(len(tiles), inner, outer))
+    stride, largest = 2, max(tile.outer.rows * tile.outer.cols for tile in tiles)
+    while rows * cols / stride**2 > max(posts, largest):
+        stride *= 2
+    return Plan(shape, images, stride, tuple(tiles), AT_REST + per_post * largest)
+
+
+def plan_tiles(files, grid_settings, tiling, output):
+    """The plan of a run; that of an earlier one that was broken off goes on.
+
+    Parameters
+    ----------
+    files : SceneFiles
+    grid_settings : GridSettings or None
+    tiling : Tiling or None
+    output : path
+        Of the run, beside which a broken run has left its tiles.
+
+    Returns
+    -------
+    plan : Plan
+    """
+    tiling = tiling or Tiling()
+    side, shape = tiling.side, view_grid(files, grid_settings).shape
+    if tiling.memory is None and side is None:
+        side = earlier_side(work_folder(output))
+    memory = free_memory() * MEMORY_SHARE if tiling.memory is None else tiling.memory
+    whole = make_plan(shape, len(files.images), memory, side)
+    if tiling.workers == 1 or not whole.is_tiled:
+        return whole
+    return make_plan(shape, len(files.images), memory / tiling.workers, side)
+
+
+def work_folder(output):
+    """Where a run keeps its tiles until all are done."""
+    output = Path(os.path.realpath(output))
+    return output.with_name(f".{output.name}.tiles")
+
+
+def earlier_side(folder):
+    """Side of the tiles that a broken run has left, posts; None without one."""
+    try:
+        return int(json.loads((folder / "plan.json").read_text(encoding="utf-8"))["side"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _cuts(size, side):
+    """Begin and end of each tile along one side."""
+    begins = list(range(0, size, side))
+    return list(zip(begins, [*begins[1:], size], strict=True))
+
+
+def coarse_grid(grid, stride):
+    """Every so manieth post of a grid, as a grid of its own.
+
+    Parameters
+    ----------
+    grid : Grid
+    stride : int
+
+    Returns
+    -------
+    coarse : Grid
+        Post (i, j) stands where post (stride i, stride j) of ``grid`` does; the last ones may stand
+        beyond it.
+    """
+    shift = (1 - stride) / 2
+    affine = grid.affine @ Affine.translation(shift, shift) @ Affine.scale(stride)
+    shape = tuple(-(-(size - 1) // stride) + 1 for size in grid.shape)
+    return Grid(shape, affine, grid.crs, grid.body)
+
+
+def read_memory(text):
+    """Bytes from a text such as ``8GB``.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    size : float, bytes
+
+    Examples
+    --------
+    >>> read_memory("1.5 GB")
+    1500000000.0
+    """
+    found = re.fullmatch(r"\s*([0-9.]+)\s*([KMGT]?B?)\s*", text, re.IGNORECASE)
+    unit = found[2].upper() if found else ""
+    unit = f"{unit}B" if unit and not unit.endswith("B") else unit
+    try:
+        size = float(found[1]) * UNITS["" if unit == "B" else unit] if found else 0.0
+    except ValueError:
+        size = 0.0
+    if not 0 < size < math.inf:
+        raise InputError(f"memory = {text!r} is not a size. Give one like 8GB or 500MB.")
+    return size
+
+
+def free_memory():
+    """Bytes that programs may take now, the system's and a control group's limit respected."""
+    sizes = [float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))]
+    try:
+        text = Path("/proc/meminfo").read_text(encoding="ascii")
+        sizes.append(float(text.split("MemAvailable:")[1].split()[0]) * 1024)
+    except (OSError, IndexError, ValueError):
+        pass
+    try:
+        sizes.append(float(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
+    except (OSError, ValueError):  # "max" is no number: no limit
+        pass
+    return min(sizes)
+
+
+def blend_weights(tile, window, shape):
+    """Share of a tile at the posts of a window; the shares of all tiles sum to 1.
+
+    Parameters
+    ----------
+    tile : Tile
+    window : Window
+    shape : tuple of int
+        Of the scene.
+
+    Returns
+    -------
+    weights : float32 array (rows, cols)
+    """
+    along = []
+    ends = (tile.inner.row, tile.inner.rows), (tile.inner.col, tile.inner.cols)
+    places = (window.row, window.rows), (window.col, window.cols)
+    for (first, size), (begin, count), whole in zip(ends, places, shape, strict=True):
+        post = begin + np.arange(count)
+        is_last = first + size >= whole
+        share = np.ones(count) if first == 0 else _rise(post - first)
+        along.append(share if is_last else share - _rise(post - first - size))
+    return (along[0][:, None] * along[1]).astype(np.float32)
+
+
+def _rise(offset):
+    """From 0 to 1 across a border between tiles, flat to the second derivative at both ends."""
+    t = np.clip((offset + 0.5) / BLEND + 0.5, 0.0, 1.0)
+    return t**3 * (10 - 15 * t + 6 * t**2)

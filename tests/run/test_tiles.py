@@ -1,0 +1,178 @@
+"""Scenes cut into tiles: the same answer as in one piece, and runs that can be broken off."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from benchmarks.scenes import Scene, make_scene
+
+from lommel.errors import InputError, LommelError
+from lommel.io.raster import read_grid, read_pixels
+from lommel.run import tiles
+from lommel.run.inputs import SceneFiles
+from lommel.run.shape_from_shading import run_shape_from_shading
+from lommel.run.tiles_plan import (
+    HALO,
+    STEP,
+    Tiling,
+    blend_weights,
+    coarse_grid,
+    make_plan,
+    read_memory,
+    work_folder,
+)
+from lommel.run.tiles_records import read_record
+from lommel.scene.grid import Window
+
+POSTS, SIDE = 320, 128  # nine tiles, the halos of most of which end inside the scene
+BORDER = 64  # posts at the outer border left out
+
+
+def files_of(folder):
+    return SceneFiles(
+        tuple(sorted(folder.glob("img*.tif"))),
+        (folder / "init_dem.tif",),
+        folder / "sun_positions.txt",
+    )
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene")
+    make_scene(Scene(POSTS, 2, finest_detail=1.0), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(scene, tmp_path_factory):
+    output = tmp_path_factory.mktemp("whole") / "out"
+    run_shape_from_shading(files_of(scene), output)
+    return output
+
+
+@pytest.fixture(scope="module")
+def tiled(scene, tmp_path_factory):
+    output = tmp_path_factory.mktemp("tiled") / "out"
+    run_shape_from_shading(files_of(scene), output, tiling=Tiling(side=SIDE))
+    return output
+
+
+def test_tiles_cover_every_post_once_and_share_every_post_wholly():
+    plan = make_plan((700, 450), 2, 1e9, side=STEP)
+    count, share = np.zeros(plan.shape, int), np.zeros(plan.shape)
+    for tile in plan.tiles:
+        count[tile.inner.slices] += 1
+        share += blend_weights(tile, Window(0, 0, *plan.shape), plan.shape)
+        assert tile.outer.row == max(tile.inner.row - HALO, 0)
+    assert (count == 1).all()
+    np.testing.assert_allclose(share, 1, atol=1e-6)  # float32
+
+
+@pytest.mark.parametrize("memory", [1e9, 4e9])
+def test_a_plan_stays_within_memory(memory):
+    plan = make_plan((20_000, 20_000), 3, memory)
+    assert plan.is_tiled
+    assert plan.memory <= memory
+    assert plan.shape[0] * plan.shape[1] / plan.stride**2 * 250 < memory
+    assert not make_plan((500, 500), 3, memory).is_tiled
+
+
+def test_too_little_memory_is_refused_with_what_is_needed():
+    with pytest.raises(InputError, match=r"a tile of 256 posts needs 0\.\d+ GB"):
+        make_plan((20_000, 20_000), 3, 3.2e8)
+
+
+@pytest.mark.parametrize(("text", "size"), [("8GB", 8e9), ("500 mb", 5e8), ("2g", 2e9)])
+def test_sizes_are_read(text, size):
+    assert read_memory(text) == size
+
+
+@pytest.mark.parametrize("text", ["", "much", "-3GB", "0", "1.2.3GB", "8 apples"])
+def test_what_is_no_size_is_refused(text):
+    with pytest.raises(InputError, match="8GB"):
+        read_memory(text)
+
+
+def test_posts_of_the_coarse_grid_are_posts_of_the_fine_one(scene):
+    grid = read_grid(scene / "init_dem.tif")
+    row, col = coarse_grid(grid, 4).lonlat_at(np.array([0, 5, 40]), np.array([3, 0, 77]))
+    fine_row, fine_col = grid.index_at(row, col)
+    np.testing.assert_allclose(fine_row, [0, 20, 160], atol=1e-5)
+    np.testing.assert_allclose(fine_col, [12, 0, 308], atol=1e-5)
+
+
+def test_tiles_give_nearly_the_heights_of_one_piece(scene, whole, tiled):
+    truth, one, many = (
+        read_pixels(path / name)[BORDER:-BORDER, BORDER:-BORDER]
+        for path, name in ((scene, "truth_dem.tif"), (whole, "dem.tif"), (tiled, "dem.tif"))
+    )
+    error = np.std(one - truth)
+    assert np.std(many - one) < 0.5 * error  # long waves, see docs/scaling.md
+    assert np.std(many - truth) < 1.2 * error
+
+
+def test_no_seam_shows_in_the_second_derivative(whole, tiled):
+    change = read_pixels(tiled / "dem.tif") - read_pixels(whole / "dem.tif")
+    for axis in (0, 1):
+        bend = np.abs(np.diff(change, 2, axis=axis)).mean(axis=1 - axis)
+        seams = np.concatenate([bend[k - 34 : k + 34] for k in (SIDE, 2 * SIDE - 8)])
+        assert seams.max() < 3 * np.median(bend[BORDER:-BORDER]) + 1e-4  # m
+
+
+def test_products_and_record_are_those_of_one_piece(whole, tiled):
+    assert {p.name for p in whole.iterdir()} == {p.name for p in tiled.iterdir()}
+    for name in ("albedo", "hillshade-after", "separation", "measured", "modelled"):
+        one, many = (read_pixels(folder / f"{name}.tif") for folder in (whole, tiled))
+        assert one.shape == many.shape
+        assert np.nanmedian(np.abs(many - one)) < 0.02 * np.nanmedian(np.abs(one))
+    record = json.loads((tiled / "run.json").read_text())
+    assert record["outcome"]["name"] == "converged"
+    assert len(record["settings"]["tiles"]) == record["results"]["tiles"] == 9
+
+
+def test_a_broken_run_goes_on_and_gives_the_same_bytes(scene, tiled, tmp_path, monkeypatch):
+    output, solved = tmp_path / "out", []
+    solve = tiles.solve_tile
+
+    def solve_some(files, grid, tile, *rest):
+        if len(solved) == 4:
+            raise KeyboardInterrupt
+        solved.append(tile.number)
+        return solve(files, grid, tile, *rest)
+
+    monkeypatch.setattr(tiles, "solve_tile", solve_some)
+    with pytest.raises(KeyboardInterrupt):
+        run_shape_from_shading(files_of(scene), output, tiling=Tiling(side=SIDE))
+    assert not output.exists()
+    (work_folder(output) / "tile-00002" / "record.json").write_text("{")  # cut off
+    monkeypatch.setattr(
+        tiles, "solve_tile", lambda *job: solved.append(job[2].number) or solve(*job)
+    )
+    monkeypatch.setattr(tiles, "prepare_scene", None)  # done already
+    run_shape_from_shading(files_of(scene), output)  # the size of the tiles is remembered
+    assert solved == [0, 1, 2, 3, 2, 4, 5, 6, 7, 8]
+    assert not work_folder(output).exists()
+    for path in tiled.glob("*.tif"):
+        assert path.read_bytes() == (output / path.name).read_bytes()
+
+
+def test_a_failing_tile_is_tried_again_and_told_while_the_others_finish(
+    scene, tmp_path, monkeypatch
+):
+    output, tried = tmp_path / "out", []
+    solve = tiles.solve_tile
+
+    def fail(files, grid, tile, *rest):
+        tried.append(tile.number)
+        if tile.number == 1:
+            raise OSError("disk fell out")
+        return solve(files, grid, tile, *rest)
+
+    monkeypatch.setattr(tiles, "solve_tile", fail)
+    with pytest.raises(LommelError, match="tile 1: OSError: disk fell out"):
+        run_shape_from_shading(files_of(scene), output, tiling=Tiling(side=256))
+    assert tried == [0, 1, 2, 3, 1]
+    digests = [read_record(work_folder(output) / f"tile-0000{k}").get("digest") for k in range(4)]
+    assert digests[1] is None and None not in (digests[0], digests[2], digests[3])
+    shutil.rmtree(work_folder(output))
