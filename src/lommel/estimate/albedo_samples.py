@@ -124,8 +124,8 @@ class SampleBlocks:
     slope_noise : float, rad, or None
         :math:`\kappa`, slope error per relative error of brightness; None gives every pixel of
         every image the same variance.
-    kept_pixels : int
-        Pixels of all images up to which samples are kept, 24 bytes each.
+    kept_pixels : int, optional
+        Pixels of all images up to which samples are kept, 24 bytes each; `KEPT_PIXELS`.
 
     Attributes
     ----------
@@ -136,9 +136,7 @@ class SampleBlocks:
         One per observation, empty where it is used.
     """
 
-    def __init__(
-        self, observations, grid, heights, model, masks, slope_noise, kept_pixels=KEPT_PIXELS
-    ):
+    def __init__(self, observations, grid, heights, model, masks, slope_noise, kept_pixels=None):
         self.grid, self.heights, self.model = grid, heights, model
         self.masks, self.slope_noise = masks, slope_noise
         thin = [_thinned(image.measured) for image in observations]
@@ -156,6 +154,7 @@ class SampleBlocks:
         self.windows = np.array(windows, np.int64).reshape(-1, 4)
         self.pixels = int(np.sum(self.windows[:, 2] * self.windows[:, 3]))
         self.count = max(BLOCKS, -(-self.pixels // PIXELS_AT_ONCE))
+        kept_pixels = KEPT_PIXELS if kept_pixels is None else kept_pixels
         self._kept = {} if self.pixels <= kept_pixels else None
 
     def span(self, block):
@@ -276,7 +275,7 @@ class Frame:
         above, below = max(first - 1, 0), min(first + part.rows + 1, self.window.rows)
         around = ((first - above, below - first - part.rows), (0, 0))
         inside = slice(first - above, first - above + part.rows)
-        measured = np.asarray(self.image.measured[above:below])
+        measured = self.image.measured[above:below]
         usable = pixel_weights(
             measured,
             np.pad(geometry.cos_incidence, around, mode="edge"),
@@ -323,8 +322,8 @@ def _thinned(measured):
     """At most about `THIN` pixels of an image, rows spread evenly."""
     step = max(1, -(-measured.shape[0] * measured.shape[1] // THIN))
     if step == 1:
-        return np.asarray(measured)
-    return np.concatenate([np.asarray(measured[row]) for row in range(0, len(measured), step)])
+        return measured[:]
+    return np.concatenate([measured[row] for row in range(0, len(measured), step)])
 
 
 def _strips(window, every):

@@ -4,6 +4,7 @@ Most callers want `run_albedo`.
 """
 
 import csv
+from contextlib import closing
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -15,11 +16,12 @@ from lommel.estimate.albedo_quality import (
     slope_towards_sun,
 )
 from lommel.estimate.albedo_settings import AlbedoSettings, published_settings
-from lommel.io.raster import write_raster
+from lommel.run.albedo_products import Products
 from lommel.run.inputs import GridSettings, SceneFiles, Skipped
 from lommel.run.mixed_scene import raw_cameras, read_mixed_scene
 from lommel.run.products import RunRecord, output_folder
 from lommel.run.register import settle_cameras
+from lommel.run.stored_rows import RowStore
 
 SHARED_NAMES = ("phase_c1_per_rad", "phase_c2", "falloff_v2_per_rad2", "falloff_v4_per_rad4")
 
@@ -84,36 +86,29 @@ def run_albedo(
         asdict(settings)
         | {"grid": asdict(grid_settings or GridSettings()), "registers": registers},
     )
-    with output_folder(output, overwrite) as folder:
+    with output_folder(output, overwrite) as folder, closing(RowStore(folder)) as store:
         with record.stage("read"):
             settled, lost, remark = settle_cameras(files, folder, registers, raw_cameras(files))
-            scene = read_mixed_scene(settled, grid_settings, progress=progress)
+            scene = read_mixed_scene(settled, grid_settings, progress=progress, store=store)
             record.add_inputs([*files.images, *files.dems, *files.cameras])
             tables = (files.sun_positions, files.spacecraft_positions)
             record.add_inputs([path for path in tables if path is not None])
-        with record.stage("solve"):
-            result = estimate_albedo(scene.observations, scene.grid, scene.heights, settings)
+        with record.stage("solve"), Products(folder, scene.grid) as products:
+            result = estimate_albedo(
+                scene.observations, scene.grid, scene.heights, settings, take=products.take
+            )
         with record.stage("write"):
             names = [observation.name for observation in scene.observations]
             reasons = zip(names, result.reasons, strict=True)
             unused = [Skipped(name, f"{name}: {reason}") for name, reason in reasons if reason]
             skipped = [*lost, *scene.skipped]
             record.add_skipped([*skipped, *unused])
-            _write_rasters(folder, scene.grid, result)
             _write_exposures(folder / "exposures.csv", names, result, skipped)
-        record.results = _results(scene, result)
+            record.results = _results(scene, result, products)
         record.history = result.history
         record.outcome = {"name": result.outcome, "sentence": result.advice + remark}
         record.write(folder)
     return record.results
-
-
-def _write_rasters(folder, grid, result):
-    write_raster(folder / "albedo.tif", result.albedo, grid, "albedo, mean exposure 1", "1")
-    write_raster(folder / "orthomosaic.tif", result.orthomosaic, grid, "mean image value")
-    write_raster(folder / "count.tif", result.count.astype(np.uint16), grid, "images used")
-    error = 100.0 * result.albedo_error / result.albedo
-    write_raster(folder / "residual.tif", error, grid, "standard error of the albedo", "percent")
 
 
 def _write_exposures(path, names, result, skipped):
@@ -137,23 +132,26 @@ def _write_exposures(path, names, result, skipped):
             writer.writerow([skip.name, "", "", "", "", 0, skip.reason])
 
 
-def _results(scene, result):
+def _results(scene, result, products):
     """Numbers of the run; see `lommel.estimate.albedo_quality` for what they mean."""
     used = [not reason for reason in result.reasons]
     suns = [o.sun_position for o, is_used in zip(scene.observations, used, strict=True) if is_used]
-    slope = slope_towards_sun(scene.grid, scene.heights, suns)
-    correlation, _ = shading_in_albedo(result.albedo, slope)
-    known = np.isfinite(result.albedo_error)
-    error = result.albedo_error[known] / result.albedo[known]
+    middle = products.middle
+    slope = slope_towards_sun(scene.grid.cut(middle), scene.heights[middle.slices], suns)
+    correlation, _ = shading_in_albedo(products.detail, slope)
+    error = products.thin.albedo_error / products.thin.albedo
+    known = np.isfinite(error)
+    ramp = brightness_ramp(products.thin.albedo, products.thin.count)
     return {
         "images": int(np.sum(used)),
         "disagreement_before_percent": 100.0 * result.disagreement_before,
         "disagreement_after_percent": 100.0 * result.disagreement,
-        "albedo_error_percent": 100.0 * float(np.median(error)) if known.any() else np.nan,
-        "brightness_ramp_percent": 100.0 * np.expm1(brightness_ramp(result.albedo, result.count)),
+        "albedo_error_percent": 100.0 * float(np.median(error[known])) if known.any() else np.nan,
+        "brightness_ramp_percent": 100.0 * np.expm1(ramp),
         "shading_correlation": correlation,
         "noise_percent": 100.0 * result.noise,
         "pixels_per_independent_residual": result.repetition,
+        "passes": result.passes,
         **{
             name: float(value)
             for name, value, error in zip(

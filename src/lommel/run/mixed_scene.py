@@ -31,7 +31,7 @@ from lommel.scene.body import MOON
 from lommel.scene.geometry import Observation
 
 
-def read_mixed_scene(files, grid_settings=None, body=MOON, progress=iter):
+def read_mixed_scene(files, grid_settings=None, body=MOON, progress=iter, store=None):
     """Terrain, orthoimages and raw images on one grid.
 
     Parameters
@@ -41,6 +41,8 @@ def read_mixed_scene(files, grid_settings=None, body=MOON, progress=iter):
     body : Body
     progress : callable
         Wraps the iterable of images, as ``rich.progress.track`` does.
+    store : function (observation), optional
+        As in `read_scene`.
 
     Returns
     -------
@@ -50,7 +52,7 @@ def read_mixed_scene(files, grid_settings=None, body=MOON, progress=iter):
     refuse_duplicates(files.images)
     cameras = raw_cameras(files)
     if not any(cameras):
-        return read_scene(files, grid_settings, "images", body, progress)
+        return read_scene(files, grid_settings, "images", body, progress, store)
     settings = grid_settings or GridSettings()
     pairs = [pair for pair in zip(files.images, cameras, strict=True) if pair[1] is not None]
     images, skipped = read_raw_images(
@@ -76,6 +78,8 @@ def read_mixed_scene(files, grid_settings=None, body=MOON, progress=iter):
                 found[path] = _observe_raw(*task, grid, terrain)
             else:
                 found[path] = observe(*task, grid, heights, tables, body)
+            if store is not None:
+                found[path] = store(found[path])
         except LommelError as error:
             skipped.append(Skipped(path.name, str(error)))
     if not found:
