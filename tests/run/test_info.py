@@ -7,9 +7,11 @@ import pytest
 from affine import Affine
 
 from lommel.errors import InputError
+from lommel.io.isd import write_isd
 from lommel.io.raster import write_raster
 from lommel.run.info import describe
 from lommel.scene.body import MOON, to_xyz
+from lommel.scene.camera import FrameCamera, nadir_rotation
 from lommel.scene.grid import Grid, grid_from_bounds, read_crs
 
 DEGREE = 2e-6  # degrees, the facts are rounded to 1e-6
@@ -142,3 +144,21 @@ def test_apollo_frame_at_hadley_has_a_morning_sun(real_data):
     assert facts["spacecraft_altitude_m"] == pytest.approx(106e3, abs=2e3)
     assert 60 < facts["incidence_deg"] < 63
     assert 90 < facts["sun_azimuth_deg"] < 115
+
+
+def test_a_camera_file_alone_is_described(tmp_path):
+    """Straight down from 100 km: the spacing is distance over focal length."""
+    position = np.array([MOON.radius + 100e3, 0.0, 0.0])
+    camera = FrameCamera(
+        position,
+        nadir_rotation(position, np.array([0.0, 1.0, 0.0])),
+        focal_length=1000.0,
+        principal_point=(50.0, 60.0),
+        shape=(100, 120),
+        sun_position=1.5e11 * np.array([0.8, 0.6, 0.0]),
+    )
+    write_isd(tmp_path / "frame.json", camera)
+    facts = describe(tmp_path / "frame.json")
+    assert (facts["rows"], facts["cols"]) == (100, 120)
+    assert facts["gsd_m"] == pytest.approx(100.0, rel=1e-3)
+    assert facts["longitude_deg"] == pytest.approx(0.0, abs=1e-6)

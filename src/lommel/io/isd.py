@@ -170,6 +170,7 @@ def _line_scan(isd, shape):
     )
 
 
+ISD_SUFFIXES = (".json", ".isd")
 MODELS = {FRAME: _frame, LINE_SCAN: _line_scan}
 
 

@@ -5,11 +5,14 @@ Most callers want `describe_pixel`.
 
 from dataclasses import replace
 
+from pathlib import Path
+
 import numpy as np
 from scipy.ndimage import map_coordinates
 
 from lommel.errors import GeometryError, InputError
 from lommel.io.cameras import find_camera, read_camera
+from lommel.io.isd import ISD_SUFFIXES, isd_shape
 from lommel.io.positions import find_position, read_positions
 from lommel.io.raster import raster_info, read_grid
 from lommel.run.inputs import known_heights
@@ -86,7 +89,9 @@ def describe_pixel(path, sample, line, dem=None, camera=None, sun_positions=None
 
 
 def image_camera(path, camera=None):
-    """The camera of an image: in the file that is named, beside it, or in it."""
+    """The camera of an image: in the file that is named, beside it, or in it; or an ISD itself."""
+    if Path(path).suffix.lower() in ISD_SUFFIXES:
+        return read_camera(path, isd_shape(path))
     shape = raster_info(path).shape
     camera = camera or find_camera(path)
     if camera is None:

@@ -3,11 +3,13 @@
 Most callers want `describe`.
 """
 
+from pathlib import Path
+
 import numpy as np
 
 from lommel.errors import InputError
 from lommel.io.cameras import find_camera, read_camera
-from lommel.io.isd import write_isd
+from lommel.io.isd import ISD_SUFFIXES, write_isd
 from lommel.io.positions import find_position, read_positions
 from lommel.io.raster import raster_info
 from lommel.run.camera_facts import camera_facts
@@ -57,7 +59,7 @@ def describe(path, sun_positions=None, spacecraft_positions=None, camera=None, b
     Parameters
     ----------
     path : path
-        Any raster GDAL reads. One without a CRS has its place from its camera; without that, only
+        An ISD, or any raster GDAL reads. One without a CRS has its place from its camera; without that, only
         its pixels are described.
     sun_positions, spacecraft_positions : path, optional
         Position tables. With the Sun come the subsolar point and the light at the image's centre,
@@ -72,6 +74,11 @@ def describe(path, sun_positions=None, spacecraft_positions=None, camera=None, b
     facts : dict of str to str, int, float or None
         Angles at the centre are those on the sphere; azimuth is clockwise from north.
     """
+    if Path(path).suffix.lower() in ISD_SUFFIXES:
+        model = image_camera(path)
+        rows, cols = model.shape
+        facts = {"file": str(path), "rows": rows, "cols": cols}
+        return facts | camera_facts(str(path), model, None, body)
     info = raster_info(path, body)
     camera = camera or (None if info.grid else find_camera(path))
     facts = {
