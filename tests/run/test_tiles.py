@@ -1,12 +1,15 @@
 """Scenes cut into tiles: the same answer as in one piece, and runs that can be broken off."""
 
 import json
+import os
 import shutil
 
 import numpy as np
 import pytest
 from benchmarks.scenes import Scene, make_scene
+from typer.testing import CliRunner
 
+from lommel.cli import app
 from lommel.errors import InputError, LommelError
 from lommel.io.raster import read_grid, read_pixels
 from lommel.run import tiles
@@ -176,3 +179,30 @@ def test_a_failing_tile_is_tried_again_and_told_while_the_others_finish(
     digests = [read_record(work_folder(output) / f"tile-0000{k}").get("digest") for k in range(4)]
     assert digests[1] is None and None not in (digests[0], digests[2], digests[3])
     shutil.rmtree(work_folder(output))
+
+
+def test_processes_give_the_same_bytes_and_share_the_cores(scene, tiled, tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "7")
+    output = tmp_path / "out"
+    tiling = Tiling(engine="processes", side=SIDE)
+    run_shape_from_shading(files_of(scene), output, tiling=tiling)
+    for path in tiled.glob("*.tif"):
+        assert path.read_bytes() == (output / path.name).read_bytes()
+    assert os.environ["NUMBA_NUM_THREADS"] == "7"  # as it was
+
+
+def test_a_dry_run_shows_the_plan_and_writes_nothing(scene, tmp_path):
+    files = files_of(scene)
+    command = ["sfs", *map(str, files.images), "--dem", str(files.dems[0]), "--dry-run"]
+    command += ["--sun-positions", str(files.sun_positions), "--output", str(tmp_path / "out")]
+    shown = CliRunner().invoke(app, command)
+    assert shown.exit_code == 0
+    assert "320 x 320, 2 images" in shown.output
+    assert [line.split()[0] for line in shown.output.splitlines()] == [
+        "posts",
+        "tiles",
+        "memory",
+        "disk",
+        "time",
+    ]
+    assert not list(tmp_path.iterdir())

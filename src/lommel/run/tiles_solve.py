@@ -26,7 +26,7 @@ from lommel.run.views import read_views
 from lommel.scene.grid import Window
 
 SAMPLE = 513  # posts along each side of the windows that tell priors and photometry
-SAMPLES = 5  # of them at most, along each side of the scene
+SAMPLES = 3  # of them along each side of a larger scene
 # The coarse surface errs by what area means and a coarse grid leave. Held more firmly the rim
 # passes that on: with 0.05 tiles differ from one piece twice as much as with 1 or 1000
 RIM_ERROR = 1.0  # times the change of height from post to post that the roughness stands for
@@ -193,7 +193,7 @@ def _sample_windows(shape):
     rows, cols = (min(size, SAMPLE) for size in shape)
     begins = []
     for size, length in zip(shape, (rows, cols), strict=True):
-        count = 1 if size <= SAMPLE else min(2 * (size // (2 * SAMPLE)) + 3, SAMPLES)
+        count = 1 if size <= SAMPLE else SAMPLES
         begins.append(np.linspace(0, size - length, count).astype(int).tolist())
     windows = [Window(row, col, rows, cols) for row in begins[0] for col in begins[1]]
     middle = windows.pop(len(windows) // 2)
