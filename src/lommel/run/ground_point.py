@@ -4,7 +4,6 @@ Most callers want `describe_pixel`.
 """
 
 from dataclasses import replace
-
 from pathlib import Path
 
 import numpy as np

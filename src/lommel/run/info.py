@@ -59,8 +59,8 @@ def describe(path, sun_positions=None, spacecraft_positions=None, camera=None, b
     Parameters
     ----------
     path : path
-        An ISD, or any raster GDAL reads. One without a CRS has its place from its camera; without that, only
-        its pixels are described.
+        An ISD, or any raster GDAL reads. One without a CRS has its place from its camera; without
+        that, only its pixels are described.
     sun_positions, spacecraft_positions : path, optional
         Position tables. With the Sun come the subsolar point and the light at the image's centre,
         with the spacecraft the subspacecraft point and the view, with both the phase. A camera

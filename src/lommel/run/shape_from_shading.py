@@ -273,11 +273,13 @@ def hillshade(grid, heights, view):
 
     Returns
     -------
-    shade : float32 array (rows - 1, cols - 1), dimensionless
+    shade : float32 array (rows - 1, cols - 1), dimensionless; NaN beside holes
     """
     surface = Surface(grid, float(np.nanmean(heights, dtype=float)))
-    u = surface.posts_from_heights(heights)
-    return lambert_image(surface, u, view)
+    known = np.isfinite(heights)
+    u = np.where(known, surface.posts_from_heights(heights), np.float32(0))
+    all_known = known[1:, 1:] & known[1:, :-1] & known[:-1, 1:] & known[:-1, :-1]
+    return np.where(all_known, lambert_image(surface, u, view), np.float32(np.nan))
 
 
 def relative_residual(surface):
