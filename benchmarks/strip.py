@@ -1,4 +1,4 @@
-"""Albedo of a whole orbit: a strip of overlapping frames of any size, made, solved and removed.
+"""Albedo of a whole orbit: a strip of overlapping frames of any size, made and solved.
 
     python -m benchmarks.strip --frames 40 --size 2500 --folder /tmp/strip
 
@@ -147,7 +147,7 @@ def _write_image(folder, k, camera, sun, exposure, ground, grid, window):
 
 
 def main():
-    """Make, solve, report, remove."""
+    """Make, solve, report; the folder stays for a look and is removed by hand."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=40)
     parser.add_argument("--size", type=int, default=1000, help="posts along a frame")
