@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 
 from lommel.cli import app
 from lommel.errors import InputError, LommelError
-from lommel.io.raster import read_grid, read_pixels
+from lommel.io import raster
+from lommel.io.raster import read_grid, read_on_grid, read_pixels
 from lommel.run import tiles
 from lommel.run.inputs import SceneFiles
 from lommel.run.shape_from_shading import run_shape_from_shading
@@ -25,7 +26,7 @@ from lommel.run.tiles_plan import (
     read_memory,
     work_folder,
 )
-from lommel.run.tiles_records import read_record
+from lommel.run.tiles_records import digest_of, is_done, read_record, save_part
 from lommel.scene.grid import Window
 
 POSTS, SIDE = 320, 128  # nine tiles, the halos of most of which end inside the scene
@@ -206,3 +207,22 @@ def test_a_dry_run_shows_the_plan_and_writes_nothing(scene, tmp_path):
         "time",
     ]
     assert not list(tmp_path.iterdir())
+
+
+def test_a_part_made_from_other_settings_or_inputs_is_not_taken_for_done(tmp_path):
+    part, digest = tmp_path / "tile", digest_of([{"max_steps": 8}, "inputs"])
+    save_part(part, {"dem": np.ones(3)}, {"digest": digest})
+    assert is_done(part, digest)
+    assert not is_done(part, digest_of([{"max_steps": 9}, "inputs"]))
+    assert not is_done(part, digest_of([{"max_steps": 8}, "other inputs"]))
+    save_part(part, {"dem": np.zeros(3)}, {"digest": "new"})
+    assert not is_done(part, digest)
+    assert [path.name for path in tmp_path.iterdir()] == ["tile"]
+
+
+def test_a_dem_read_by_halves_is_the_dem_read_at_once(scene, monkeypatch):
+    coarse = coarse_grid(read_grid(scene / "init_dem.tif"), 4)
+    at_once = read_on_grid(scene / "init_dem.tif", coarse)
+    monkeypatch.setattr(raster, "PIXELS_AT_ONCE", 5000)
+    by_halves = read_on_grid(scene / "init_dem.tif", coarse)
+    np.testing.assert_allclose(by_halves, at_once, atol=1e-3)  # m, float32 sums of other order
