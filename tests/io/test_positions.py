@@ -85,6 +85,11 @@ def test_unusable_table_is_an_error(tmp_path, text, message):
         read_positions(table(tmp_path, text), "spacecraft", MOON)
 
 
+def test_a_position_beyond_the_solar_system_is_an_error_even_with_its_unit_named(tmp_path):
+    with pytest.raises(InputError, match="distances from 2e.151"):
+        read_positions(table(tmp_path, "A 0 0 2e151"), "sun", MOON, "km")
+
+
 def test_unit_that_does_not_exist_is_an_error(tmp_path):
     with pytest.raises(InputError, match=r"unit = 'miles' is not known\. Choose auto, m or km"):
         read_positions(table(tmp_path, "A 1500 1000 -300"), "spacecraft", MOON, "miles")

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+from hashlib import sha256
 
 import numpy as np
 import pytest
@@ -39,6 +40,10 @@ def files_of(folder):
         (folder / "init_dem.tif",),
         folder / "sun_positions.txt",
     )
+
+
+def fingerprints(folder):
+    return {p.name: sha256(p.read_bytes()).hexdigest() for p in folder.glob("*.tif")}
 
 
 @pytest.fixture(scope="module")
@@ -157,8 +162,7 @@ def test_a_broken_run_goes_on_and_gives_the_same_bytes(scene, tiled, tmp_path, m
     run_shape_from_shading(files_of(scene), output)  # the size of the tiles is remembered
     assert solved == [0, 1, 2, 3, 2, 4, 5, 6, 7, 8]
     assert not work_folder(output).exists()
-    for path in tiled.glob("*.tif"):
-        assert path.read_bytes() == (output / path.name).read_bytes()
+    assert fingerprints(output) == fingerprints(tiled)
 
 
 def test_a_failing_tile_is_tried_again_and_told_while_the_others_finish(
@@ -187,8 +191,7 @@ def test_processes_give_the_same_bytes_and_share_the_cores(scene, tiled, tmp_pat
     output = tmp_path / "out"
     tiling = Tiling(engine="processes", side=SIDE)
     run_shape_from_shading(files_of(scene), output, tiling=tiling)
-    for path in tiled.glob("*.tif"):
-        assert path.read_bytes() == (output / path.name).read_bytes()
+    assert fingerprints(output) == fingerprints(tiled)
     assert os.environ["NUMBA_NUM_THREADS"] == "7"  # as it was
 
 

@@ -6,7 +6,7 @@ from numba import njit
 FAST = {"contract", "nsz"}
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, forceinline=True, fastmath=FAST)
 def _cubic_weights(t):
     """Catmull-Rom weights of four neighbours, at a fraction t behind the second one."""
     s = np.float32(1.0) - t
@@ -22,7 +22,7 @@ def _cubic_weights(t):
     )
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, forceinline=True, fastmath=FAST)
 def sample_linear(image, line, sample):
     """Value between pixels, bilinear; NaN outside and beside missing pixels; see `sample_cubic`."""
     lines, samples = image.shape
@@ -36,7 +36,7 @@ def sample_linear(image, line, sample):
     return upper + v * (lower - upper)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, forceinline=True, fastmath=FAST)
 def sample_cubic(image, line, sample):
     """Value between pixels: cubic; bilinear beside missing pixels and the border; NaN outside.
 

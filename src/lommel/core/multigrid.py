@@ -339,7 +339,7 @@ def _block_dots(a, b):
     return sums
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract", "reassoc", "nsz"})
 def _row_dot(a, b):
     total = 0.0
     for c in range(a.size):

@@ -23,7 +23,7 @@ BLOCK = 32  # rows per parallel work item; fixed, so sums do not depend on the t
 LARGEST_EIGENVALUE = 4.0  # of diag(A)^-1 A: the number of posts of the largest element
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract", "nsz"})
 def _cell_fluxes(upper, lower, gpp, gpq, gqq, twist, hourglass, top0, top1, bottom0, bottom1):
     """What one row of cells adds to the posts above and below it.
 
@@ -45,7 +45,7 @@ def _cell_fluxes(upper, lower, gpp, gpq, gqq, twist, hourglass, top0, top1, bott
         bottom1[c + 1] = fp + fq + bend
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract", "nsz"})
 def _second_differences(u, out):
     """``out[c + 1] = u[c - 1] - 2 u[c] + u[c + 1]`` inside, zero at both ends."""
     two = np.float32(2.0)
@@ -53,7 +53,7 @@ def _second_differences(u, out):
         out[c + 1] = u[c - 1] - two * u[c] + u[c + 1]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def _column_weights(row, rows, weights):
     """Weights of rows - 2 ... + 2 in the second differences along columns and their transpose."""
     weights[:] = 0.0
@@ -65,7 +65,7 @@ def _column_weights(row, rows, weights):
             weights[at + 1] += factor
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract", "nsz"})
 def _gather_row(u_2, u_1, u0, u1, u2, w, wxx, mass, bend, top0, top1, bottom0, bottom1, out):
     """Sum of all terms at the posts of one row."""
     w_2, w_1, w0, w1, w2 = w[0], w[1], w[2], w[3], w[4]
@@ -181,19 +181,19 @@ def inverse_diagonal(gpp, gpq, gqq, curvature, hourglass, mass, out):
         _invert_row(out[r])
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract", "nsz"})
 def _fill_row(mass, along, across, row):
     for c in range(row.size):
         row[c] = mass[c] + along[c] + across
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract", "nsz"})
 def _invert_row(row):
     for c in range(row.size):
         row[c] = np.float32(1.0) / max(row[c], np.float32(1e-30))
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract", "nsz"})
 def _cell_diagonal(gpp, gpq, gqq, sign, twist, hourglass, row):
     quarter, mixed = np.float32(0.25), np.float32(0.5 * sign)
     for c in range(gpp.size):
@@ -251,7 +251,7 @@ def coarsen_cells(fine, coarse):
             coarse[r, c] = quarter * total
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract", "nsz"})
 def _halve_row(row, out):
     """Transpose of linear interpolation along a row: out[c] = row[2c] + (neighbours) / 2."""
     half = np.float32(0.5)
@@ -290,7 +290,7 @@ def restrict(fine, coarse):
         _halve_row(line, coarse[r])
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract", "nsz"})
 def _add_interleaved(near, far, row):
     """Add the mean of two coarse rows, interpolated to every second column."""
     half, quarter = np.float32(0.5), np.float32(0.25)

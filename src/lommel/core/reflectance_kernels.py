@@ -14,7 +14,7 @@ KINDS = {"blend": 0, "power": 1, "multiple-scattering": 2}
 ZERO, QUARTER, ONE, TWO = np.float32(0), np.float32(0.25), np.float32(1), np.float32(2)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
 def blend(scale, cos_incidence, cos_emission, share, factor):
     """R = (1 - L) mu0 + scale L mu0 / (mu0 + mu), L the share."""
     lit_and_seen = (cos_incidence > ZERO) & (cos_emission > ZERO)
@@ -28,7 +28,7 @@ def blend(scale, cos_incidence, cos_emission, share, factor):
     return gain * mu0 * value, gain * (value + d_emission), gain * d_emission
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
 def power(k, cos_incidence, cos_emission, share, factor):
     """R = mu0^k mu^(k-1); no share in it."""
     lit_and_seen = (cos_incidence > ZERO) & (cos_emission > ZERO)
@@ -39,7 +39,7 @@ def power(k, cos_incidence, cos_emission, share, factor):
     return mu0 * slope, k * slope, (k - ONE) * mu0 * slope / mu
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
 def multiple_scattering(w, cos_incidence, cos_emission, share, factor):
     """R = w/4 mu0 / (mu0 + mu) (share + H(mu0) H(mu))."""
     lit_and_seen = (cos_incidence > ZERO) & (cos_emission > ZERO)

@@ -17,6 +17,7 @@ LOSSES = {"least-squares": LEAST_SQUARES, "huber": HUBER, "cauchy": CAUCHY}
 inner = njit(  # type: ignore[call-overload]
     error_model="numpy",
     fastmath={"reassoc", "contract", "nsz"},  # sums in vector registers; NaN keeps its meaning
+    forceinline=True,
     no_cpython_wrapper=True,
     no_cfunc_wrapper=True,
 )

@@ -13,7 +13,7 @@ from lommel.core.interpolation import sample_cubic
 FAST = {"contract", "nsz"}
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, forceinline=True, fastmath=FAST)
 def expand_row(plane, row, step, out):
     """Interpolate a lattice plane along one row of cells.
 
@@ -109,7 +109,7 @@ def cast_shadow(u, planes, step, highest, cells, darkest, out):
             )
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, forceinline=True, fastmath=FAST)
 def _meets_terrain(u, r, c, per_metre_row, per_metre_col, highest):
     """Follow the ray from a cell's centre, one post along the longer axis at a time."""
     half, quarter = np.float32(0.5), np.float32(0.25)

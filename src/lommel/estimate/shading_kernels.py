@@ -29,7 +29,7 @@ GPP, GPQ, GQQ, GP, GQ, AP, AQ, AA, GA = (k * LONGEST for k in range(16, 25))
 BUFFER = 25 * LONGEST
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, fastmath=FAST, error_model="numpy")
 def _lines(planes, i, t, j, step, out):
     """Value at the first cell and change per cell, of each plane along one segment of a row."""
     for k in range(planes.shape[0]):
@@ -40,7 +40,7 @@ def _lines(planes, i, t, j, step, out):
         out[2 * k + 1] = slope
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, fastmath=FAST, error_model="numpy")
 def _normals(upper, lower, gram, inverse_row, inverse_col, w, n):
     """Slopes, inverse length of the normal, and the relative change of its length with them."""
     half, one, two = np.float32(0.5), np.float32(1.0), np.float32(2.0)
@@ -59,7 +59,7 @@ def _normals(upper, lower, gram, inverse_row, inverse_col, w, n):
         w[LENGTH_Q + c] = (g02 + p * g12 + q * g22) * inverse
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, fastmath=FAST, error_model="numpy")
 def _cosines(light, w, n):
     """Cosines of incidence and emission with their derivatives by the slopes; phase terms."""
     for c in range(n):
@@ -85,7 +85,7 @@ def _cosines(light, w, n):
         w[FACTOR + c] = light[14] + x * light[15]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, fastmath=FAST, error_model="numpy")
 def _reflectances(kind, parameters, law, w, n):
     """Reflectance and its derivatives by the cosines."""
     k = np.float32(parameters[0]) if kind >= 0 else np.float32(0.0)
@@ -109,7 +109,7 @@ def _reflectances(kind, parameters, law, w, n):
             w[R + c], w[R_I + c], w[R_E + c] = law[0, c], law[1, c], law[2, c]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, fastmath=FAST, error_model="numpy")
 def _accumulate(albedo, measured, image, inverse_row, inverse_col, w, n, sums):
     """Add one image to the segment's tensors, gradients and sums."""
     exposure, haze, weight, softness = image[0], image[1], image[2], image[3]
@@ -156,7 +156,7 @@ def _accumulate(albedo, measured, image, inverse_row, inverse_col, w, n, sums):
     sums[7] += count
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, fastmath=FAST, error_model="numpy")
 def _eliminate_albedo(albedo, precision, w, n, best):
     r"""Take each cell's own albedo out of the segment's tensors and gradients.
 
@@ -187,7 +187,7 @@ def _eliminate_albedo(albedo, precision, w, n, best):
     return cost
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def _start(slope, w, n):
     for k in range(GPP, BUFFER):
         w[k] = np.float32(0.0)
@@ -196,7 +196,7 @@ def _start(slope, w, n):
         w[GQQ + c] = slope[1]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def _copy(w, start, out, n):
     for c in range(n):
         out[c] = w[start + c]

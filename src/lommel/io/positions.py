@@ -109,7 +109,7 @@ def _metres_per_unit(path, positions, kind, body, unit):
         "spacecraft": (body.radius, 100 * body.radius),
     }[kind]
     if unit != "auto":  # whoever names the unit may stand anywhere outside the body
-        near, far = body.radius, np.inf
+        near, far = body.radius, 1000 * ASTRONOMICAL_UNIT
     for scale, name in ((1000.0, "km"), (1.0, "m")):
         metres = scale * distances
         if unit in ("auto", name) and ((near < metres) & (metres < far)).all():

@@ -17,7 +17,7 @@ NONE, RADIAL, BROWN_CONRADY, RADTAN, TRANSVERSE, KAGUYA, LRO_NAC = range(7)
 STEPS = 30  # Newton needs 3 to 6; more only where nothing can be found
 CONVERGED = 1e-7  # relative length of a Newton step; the error after it is its square
 # 1 / 0 is infinite, as for arrays; damaged coefficients must not end the program
-SERIAL: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+SERIAL: dict[str, Any] = {"cache": True, "nogil": True, "forceinline": True, "error_model": "numpy"}
 FAST = {"contract", "nsz"}
 
 
