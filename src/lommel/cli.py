@@ -214,8 +214,23 @@ def sfs(
         ),
     ] = None,
     engine: Annotated[
-        str, typer.Option(help="Tiles one after the other (serial), or in processes.")
+        str,
+        typer.Option(help="Tiles one after the other (serial), in processes, or by dask."),
     ] = "serial",
+    dask_scheduler: Annotated[
+        str | None,
+        typer.Option(
+            help="Address of a Dask cluster that runs, like tcp://10.0.0.1:8786; --memory is then "
+            "what one worker may take. Default: a cluster of this machine."
+        ),
+    ] = None,
+    tiles: Annotated[
+        str | None,
+        typer.Option(
+            help="A job of an array: 0/64 prepares the scene, then 1/64 to 64/64 solve a share of "
+            "the tiles each, and `lommel merge` writes the products."
+        ),
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show tiles, memory, disk and time; solve nothing.")
     ] = False,
@@ -250,13 +265,44 @@ def sfs(
     )
     files = _files(images, dem, sun_positions, spacecraft_positions, positions_unit, cameras)
     grid = _grid(spacing, crs, bounds)
-    tiling = Tiling(None if memory is None else read_memory(memory), engine)
+    tiling = Tiling(
+        None if memory is None else read_memory(memory), engine, scheduler=dask_scheduler
+    )
     if dry_run:
         typer.echo(plan_tiles(files, grid, tiling, output))
+        return
+    if tiles is not None:
+        _solve_share(tiles, files, output, settings, grid, tiling)
         return
     with _progress("Images, tiles") as progress:
         run_shape_from_shading(files, output, settings, grid, overwrite, progress, tiling)
     _finish(output, report)
+
+
+def _solve_share(text, *request):
+    from lommel.run.tiles_array import prepare_array, read_share, solve_share
+
+    share = read_share(text)
+    with _progress("Images, tiles") as progress:
+        if share.number == 0:
+            count = prepare_array(*request, progress)
+            done = f"The scene is prepared: {count} tiles for {share.count} jobs."
+        else:
+            count = solve_share(*request, share, progress)
+            done = f"The {count} tiles of share {share} are solved."
+    log.print(done, soft_wrap=True)
+
+
+@app.command()
+def merge(
+    output: Annotated[Path, typer.Argument(help="The --output of `lommel sfs --tiles`.")],
+    overwrite: Overwrite = False,
+):
+    """Write the products of a job array when all of its shares are solved."""
+    from lommel.run.tiles_array import merge_tiles
+
+    merge_tiles(output, overwrite)
+    _finish(output, draws_report=False)
 
 
 @app.command()

@@ -3,11 +3,9 @@
 import json
 import os
 import shutil
-from hashlib import sha256
 
 import numpy as np
 import pytest
-from benchmarks.scenes import Scene, make_scene
 from typer.testing import CliRunner
 
 from lommel.cli import app
@@ -15,7 +13,6 @@ from lommel.errors import InputError, LommelError
 from lommel.io import raster
 from lommel.io.raster import read_grid, read_on_grid, read_pixels
 from lommel.run import tiles
-from lommel.run.inputs import SceneFiles
 from lommel.run.shape_from_shading import run_shape_from_shading
 from lommel.run.tiles_plan import (
     HALO,
@@ -27,43 +24,18 @@ from lommel.run.tiles_plan import (
     read_memory,
     work_folder,
 )
-from lommel.run.tiles_records import digest_of, is_done, read_record, save_part
+from lommel.run.tiles_records import digest_of, is_done, part_folder, read_record, save_part
 from lommel.scene.grid import Window
 
-POSTS, SIDE = 320, 128  # nine tiles, the halos of most of which end inside the scene
+from .tiled_scene import SIDE, files_of, fingerprints
+
 BORDER = 64  # posts at the outer border left out
 
 
-def files_of(folder):
-    return SceneFiles(
-        tuple(sorted(folder.glob("img*.tif"))),
-        (folder / "init_dem.tif",),
-        folder / "sun_positions.txt",
-    )
-
-
-def fingerprints(folder):
-    return {p.name: sha256(p.read_bytes()).hexdigest() for p in folder.glob("*.tif")}
-
-
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene")
-    make_scene(Scene(POSTS, 2, finest_detail=1.0), folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def whole(scene, tmp_path_factory):
+def whole(tile_scene, tmp_path_factory):
     output = tmp_path_factory.mktemp("whole") / "out"
-    run_shape_from_shading(files_of(scene), output)
-    return output
-
-
-@pytest.fixture(scope="module")
-def tiled(scene, tmp_path_factory):
-    output = tmp_path_factory.mktemp("tiled") / "out"
-    run_shape_from_shading(files_of(scene), output, tiling=Tiling(side=SIDE))
+    run_shape_from_shading(files_of(tile_scene), output)
     return output
 
 
@@ -103,18 +75,18 @@ def test_what_is_no_size_is_refused(text):
         read_memory(text)
 
 
-def test_posts_of_the_coarse_grid_are_posts_of_the_fine_one(scene):
-    grid = read_grid(scene / "init_dem.tif")
+def test_posts_of_the_coarse_grid_are_posts_of_the_fine_one(tile_scene):
+    grid = read_grid(tile_scene / "init_dem.tif")
     row, col = coarse_grid(grid, 4).lonlat_at(np.array([0, 5, 40]), np.array([3, 0, 77]))
     fine_row, fine_col = grid.index_at(row, col)
     np.testing.assert_allclose(fine_row, [0, 20, 160], atol=1e-5)
     np.testing.assert_allclose(fine_col, [12, 0, 308], atol=1e-5)
 
 
-def test_tiles_give_nearly_the_heights_of_one_piece(scene, whole, tiled):
+def test_tiles_give_nearly_the_heights_of_one_piece(tile_scene, whole, tiled):
     truth, one, many = (
         read_pixels(path / name)[BORDER:-BORDER, BORDER:-BORDER]
-        for path, name in ((scene, "truth_dem.tif"), (whole, "dem.tif"), (tiled, "dem.tif"))
+        for path, name in ((tile_scene, "truth_dem.tif"), (whole, "dem.tif"), (tiled, "dem.tif"))
     )
     error = np.std(one - truth)
     assert np.std(many - one) < 0.5 * error  # long waves, see docs/scaling.md
@@ -140,33 +112,32 @@ def test_products_and_record_are_those_of_one_piece(whole, tiled):
     assert len(record["settings"]["tiles"]) == record["results"]["tiles"] == 9
 
 
-def test_a_broken_run_goes_on_and_gives_the_same_bytes(scene, tiled, tmp_path, monkeypatch):
-    output, solved = tmp_path / "out", []
-    solve = tiles.solve_tile
+def test_a_broken_run_goes_on_and_gives_the_same_bytes(half_done, tile_scene, tiled, monkeypatch):
+    solved, solve = [], tiles.solve_tile
 
     def solve_some(files, grid, tile, *rest):
-        if len(solved) == 4:
+        if len(solved) == 2:
             raise KeyboardInterrupt
         solved.append(tile.number)
         return solve(files, grid, tile, *rest)
 
+    monkeypatch.setattr(tiles, "prepare_scene", None)  # done already
     monkeypatch.setattr(tiles, "solve_tile", solve_some)
     with pytest.raises(KeyboardInterrupt):
-        run_shape_from_shading(files_of(scene), output, tiling=Tiling(side=SIDE))
-    assert not output.exists()
-    (work_folder(output) / "tile-00002" / "record.json").write_text("{")  # cut off
+        run_shape_from_shading(files_of(tile_scene), half_done, tiling=Tiling(side=SIDE))
+    assert not half_done.exists()
+    (part_folder(work_folder(half_done), 2) / "record.json").write_text("{")  # cut off
     monkeypatch.setattr(
         tiles, "solve_tile", lambda *job: solved.append(job[2].number) or solve(*job)
     )
-    monkeypatch.setattr(tiles, "prepare_scene", None)  # done already
-    run_shape_from_shading(files_of(scene), output)  # the size of the tiles is remembered
-    assert solved == [0, 1, 2, 3, 2, 4, 5, 6, 7, 8]
-    assert not work_folder(output).exists()
-    assert fingerprints(output) == fingerprints(tiled)
+    run_shape_from_shading(files_of(tile_scene), half_done)  # the size of the tiles is remembered
+    assert solved == [1, 3, 2, 5, 7]
+    assert not work_folder(half_done).exists()
+    assert fingerprints(half_done) == fingerprints(tiled)
 
 
 def test_a_failing_tile_is_tried_again_and_told_while_the_others_finish(
-    scene, tmp_path, monkeypatch
+    tile_scene, tmp_path, monkeypatch
 ):
     output, tried = tmp_path / "out", []
     solve = tiles.solve_tile
@@ -179,24 +150,25 @@ def test_a_failing_tile_is_tried_again_and_told_while_the_others_finish(
 
     monkeypatch.setattr(tiles, "solve_tile", fail)
     with pytest.raises(LommelError, match="tile 1: OSError: disk fell out"):
-        run_shape_from_shading(files_of(scene), output, tiling=Tiling(side=256))
+        run_shape_from_shading(files_of(tile_scene), output, tiling=Tiling(side=256))
     assert tried == [0, 1, 2, 3, 1]
     digests = [read_record(work_folder(output) / f"tile-0000{k}").get("digest") for k in range(4)]
     assert digests[1] is None and None not in (digests[0], digests[2], digests[3])
     shutil.rmtree(work_folder(output))
 
 
-def test_processes_give_the_same_bytes_and_share_the_cores(scene, tiled, tmp_path, monkeypatch):
+def test_processes_give_the_same_bytes_and_share_the_cores(
+    half_done, tile_scene, tiled, monkeypatch
+):
     monkeypatch.setenv("NUMBA_NUM_THREADS", "7")
-    output = tmp_path / "out"
     tiling = Tiling(engine="processes", side=SIDE)
-    run_shape_from_shading(files_of(scene), output, tiling=tiling)
-    assert fingerprints(output) == fingerprints(tiled)
+    run_shape_from_shading(files_of(tile_scene), half_done, tiling=tiling)
+    assert fingerprints(half_done) == fingerprints(tiled)
     assert os.environ["NUMBA_NUM_THREADS"] == "7"  # as it was
 
 
-def test_a_dry_run_shows_the_plan_and_writes_nothing(scene, tmp_path):
-    files = files_of(scene)
+def test_a_dry_run_shows_the_plan_and_writes_nothing(tile_scene, tmp_path):
+    files = files_of(tile_scene)
     command = ["sfs", *map(str, files.images), "--dem", str(files.dems[0]), "--dry-run"]
     command += ["--sun-positions", str(files.sun_positions), "--output", str(tmp_path / "out")]
     shown = CliRunner().invoke(app, command)
@@ -223,9 +195,9 @@ def test_a_part_made_from_other_settings_or_inputs_is_not_taken_for_done(tmp_pat
     assert [path.name for path in tmp_path.iterdir()] == ["tile"]
 
 
-def test_a_dem_read_by_halves_is_the_dem_read_at_once(scene, monkeypatch):
-    coarse = coarse_grid(read_grid(scene / "init_dem.tif"), 4)
-    at_once = read_on_grid(scene / "init_dem.tif", coarse)
+def test_a_dem_read_by_halves_is_the_dem_read_at_once(tile_scene, monkeypatch):
+    coarse = coarse_grid(read_grid(tile_scene / "init_dem.tif"), 4)
+    at_once = read_on_grid(tile_scene / "init_dem.tif", coarse)
     monkeypatch.setattr(raster, "PIXELS_AT_ONCE", 5000)
-    by_halves = read_on_grid(scene / "init_dem.tif", coarse)
+    by_halves = read_on_grid(tile_scene / "init_dem.tif", coarse)
     np.testing.assert_allclose(by_halves, at_once, atol=1e-3)  # m, float32 sums of other order

@@ -20,7 +20,7 @@ from lommel.scene.grid import Grid, Window
 BYTES_PER_POST, BYTES_PER_IMAGE = 200, 16  # measured: 211 with one image, 235 with four
 AT_REST = 300e6  # bytes of a process with its modules and compiled code
 MEMORY_SHARE = 0.6  # of what is free now: a safe share, others work here as well
-ENGINES = ("serial", "processes")
+ENGINES = ("serial", "processes", "dask")
 HALO = 128  # posts beside a tile that are solved along
 BLEND = 64  # posts over which a tile goes over into the next
 STEP = 128  # posts; tiles begin at multiples of it, so that coarse levels have the same posts
@@ -37,27 +37,40 @@ class Tiling:
     Attributes
     ----------
     memory : float, bytes, or None
-        Of the whole run; None takes a safe share of what is free.
-    engine : {'serial', 'processes'}
+        Of the whole run, but of one worker where ``scheduler`` is given; None takes a safe share of
+        what is free.
+    engine : {'serial', 'processes', 'dask'}
     side : int, posts, or None
         Of a tile without its halo; None takes what fits in memory.
+    scheduler : str or None
+        Address of a Dask cluster that runs already; None starts one on this machine.
     """
 
     memory: float | None = None
     engine: str = "serial"
     side: int | None = None
+    scheduler: str | None = None
 
     def __post_init__(self):
-        """Refuse an engine that is not known."""
+        """Refuse what cannot be."""
         if self.engine not in ENGINES:
+            raise InputError(f"engine = {self.engine!r} is not known. Choose {', '.join(ENGINES)}.")
+        if self.scheduler is None:
+            return
+        if self.engine != "dask":
             raise InputError(
-                f"engine = {self.engine!r} is not known. Choose {' or '.join(ENGINES)}."
+                f"--dask-scheduler {self.scheduler} goes with --engine dask, not {self.engine}."
+            )
+        if self.memory is None and self.side is None:
+            raise InputError(
+                "--dask-scheduler needs --memory: what one worker of that cluster may take, like "
+                "--memory 8GB."
             )
 
     @property
     def workers(self):
-        """Processes at work at a time."""
-        return 1 if self.engine == "serial" else os.cpu_count() or 1
+        """Processes of this machine at work at a time."""
+        return 1 if self.engine == "serial" or self.scheduler else cores()
 
 
 @dataclass(frozen=True)
@@ -139,7 +152,7 @@ class Plan:
         )
 
 
-def make_plan(shape, images, memory, side=None):
+def make_plan(shape, images, memory, side=None, stride=None):
     """Tiles of a scene that stay within memory; one tile when all of it does.
 
     Parameters
@@ -151,6 +164,8 @@ def make_plan(shape, images, memory, side=None):
         Of one process.
     side : int, posts, optional
         Of a tile without its halo, in place of what follows from memory; a multiple of `STEP`.
+    stride : int, posts, optional
+        Of the coarse grid, in place of what follows from memory.
 
     Returns
     -------
@@ -177,9 +192,11 @@ def make_plan(shape, images, memory, side=None):
             around = Window(row - HALO, col - HALO, inner.rows + 2 * HALO, inner.cols + 2 * HALO)
             outer = around.intersection(Window(0, 0, rows, cols))
             tiles.append(Tile(len(tiles), inner, outer))
-    stride, largest = 2, max(tile.outer.rows * tile.outer.cols for tile in tiles)
-    while rows * cols / stride**2 > max(posts, largest):
-        stride *= 2
+    largest = max(tile.outer.rows * tile.outer.cols for tile in tiles)
+    if stride is None:
+        stride = 2
+        while rows * cols / stride**2 > max(posts, largest):
+            stride *= 2
     return Plan(shape, images, stride, tuple(tiles), AT_REST + per_post * largest)
 
 
@@ -199,14 +216,14 @@ def plan_tiles(files, grid_settings, tiling, output):
     plan : Plan
     """
     tiling = tiling or Tiling()
-    side, shape = tiling.side, view_grid(files, grid_settings).shape
+    side, stride, shape = tiling.side, None, view_grid(files, grid_settings).shape
     if tiling.memory is None and side is None:
-        side = earlier_side(work_folder(output))
+        side, stride = earlier_cut(work_folder(output))
     memory = free_memory() * MEMORY_SHARE if tiling.memory is None else tiling.memory
-    whole = make_plan(shape, len(files.images), memory, side)
+    whole = make_plan(shape, len(files.images), memory, side, stride)
     if tiling.workers == 1 or not whole.is_tiled:
         return whole
-    return make_plan(shape, len(files.images), memory / tiling.workers, side)
+    return make_plan(shape, len(files.images), memory / tiling.workers, side, stride)
 
 
 def work_folder(output):
@@ -215,12 +232,21 @@ def work_folder(output):
     return output.with_name(f".{output.name}.tiles")
 
 
-def earlier_side(folder):
-    """Side of the tiles that a broken run has left, posts; None without one."""
+def earlier_cut(folder):
+    """Side of the tiles and stride of the coarse grid of a broken run, posts; None without one."""
     try:
-        return int(json.loads((folder / "plan.json").read_text(encoding="utf-8"))["side"])
+        plan = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
+        return int(plan["side"]), int(plan["stride"])
     except (OSError, ValueError, KeyError, TypeError):
-        return None
+        return None, None
+
+
+def cores():
+    """Processor cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not every system tells
+        return os.cpu_count() or 1
 
 
 def _cuts(size, side):

@@ -1,19 +1,117 @@
 """What a run in tiles keeps on disk until all tiles are done, so that it can be broken off.
 
 Each part is a folder with arrays and ``record.json``, which takes its name when it is whole. A part
-counts as done when its record carries the digest of what it was made from. Most callers want
-`save_part` and `is_done`.
+counts as done when its record carries the digest of what it was made from. Several processes, also
+of several machines, may work in the folder at the same time. Most callers want `save_part` and
+`is_done`.
 """
 
 import hashlib
 import json
 import os
+import pickle
 import shutil
+import socket
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from lommel import __version__
+from lommel.errors import LommelError
+from lommel.run.inputs import SceneFiles
+from lommel.run.shape_from_shading import SfsSettings
+from lommel.run.tiles_plan import Plan
+from lommel.scene.grid import Grid
+
+RUN = "run.pickle"  # pickled, as the folder belongs to the user as compiled code does
+
+
+@dataclass(frozen=True)
+class TiledRun:
+    """What decides the tiles of a run: all that a worker has to be told, but for the folder.
+
+    Attributes
+    ----------
+    files : SceneFiles
+        With absolute paths and registered cameras.
+    grid : Grid
+        Of the whole scene.
+    plan : Plan
+    settings : SfsSettings
+    asked : dict
+        The settings as ``run.json`` shows them.
+    inputs : list of dict
+        Path, bytes and digest of each input file.
+    lost : list of Skipped
+        Images that could not be registered.
+    digest : str
+    version : str
+        Of the program.
+    """
+
+    files: SceneFiles
+    grid: Grid
+    plan: Plan
+    settings: SfsSettings
+    asked: dict
+    inputs: list
+    lost: list
+    digest: str
+    version: str = __version__
+
+
+def save_run(work, run):
+    """Keep what a run is, for its workers and for those who join later.
+
+    Also ``plan.json``, which tells how it is cut.
+
+    Parameters
+    ----------
+    work : Path
+    run : TiledRun
+    """
+    plan = {"side": run.plan.side, "stride": run.plan.stride}
+    for name, content in ((RUN, pickle.dumps(run)), ("plan.json", json.dumps(plan).encode())):
+        partial = work / f".{name}.{_me()}.partial"
+        partial.write_bytes(content)
+        partial.replace(work / name)
+
+
+def load_run(work):
+    """What `save_run` has kept.
+
+    Parameters
+    ----------
+    work : Path
+
+    Returns
+    -------
+    run : TiledRun
+        `LommelError` when there is none, or it was made by another version.
+    """
+    path = Path(work) / RUN
+    try:
+        run = pickle.loads(path.read_bytes())
+        if run.version != __version__:
+            raise LommelError(
+                f"{path} was prepared by lommel {run.version}, this is {__version__}. Use one "
+                "version on all machines, or prepare anew."
+            )
+    except OSError as error:
+        raise LommelError(
+            f"{path} cannot be read ({error.strerror}). All workers must see the folder of the "
+            "output, on a shared disk, and the run must have been prepared."
+        ) from error
+    except (pickle.PickleError, EOFError, AttributeError, ImportError, IndexError) as error:
+        raise LommelError(f"{path} is damaged ({error}). Prepare the run anew.") from error
+    return run
+
+
+def part_folder(work, number):
+    """Where a tile is kept."""
+    return Path(work) / f"tile-{number:05d}"
 
 
 def digest_of(content):
@@ -42,7 +140,7 @@ def save_part(folder, arrays, record):
     record : dict
         With ``digest``.
     """
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    partial = folder.with_name(f".{folder.name}.{_me()}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     try:
@@ -50,7 +148,11 @@ def save_part(folder, arrays, record):
             np.save(partial / f"{name}.npy", values, allow_pickle=False)
         (partial / "record.json").write_text(json.dumps(record, default=_plain), encoding="utf-8")
         shutil.rmtree(folder, ignore_errors=True)
-        partial.rename(folder)
+        try:
+            partial.rename(folder)
+        except OSError:
+            if not is_done(folder, record["digest"]):  # by another worker, who was as quick
+                raise
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
@@ -78,6 +180,28 @@ def clear_partial(folder):
     """Remove what a process that was killed has left unfinished."""
     for partial in Path(folder).glob(".*.partial"):
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def remove_work(folder):
+    """Remove a run's tiles when its products are written."""
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def disk_errors(folder):
+    """Tell what a disk refuses, in words."""
+    try:
+        yield
+    except OSError as error:
+        raise LommelError(
+            f"{folder} cannot be written: {error.strerror or error}. Make space or name another "
+            "--output; what is done is kept, and the same command goes on from there."
+        ) from error
+
+
+def _me():
+    """Name of this process among those of all machines."""
+    return f"{socket.gethostname()}.{os.getpid()}"
 
 
 def _plain(value):

@@ -1,0 +1,120 @@
+"""Tiles as tasks of a Dask cluster: one of this machine's own, or one that runs already.
+
+A worker has one tile at a time and computes it with as many threads as Dask gives the worker, so
+that workers times threads are the cores, however the cluster was started. Dask takes the tile of a
+worker that is lost to another. Most callers want `submitted`.
+"""
+
+import logging
+from contextlib import contextmanager, nullcontext
+from functools import partial
+from uuid import uuid4
+
+import numba
+from distributed import Client, LocalCluster, WorkerPlugin, get_worker
+
+from lommel.errors import InputError, LommelError
+from lommel.run.tiles_plan import cores
+
+TILE = "lommel-tile"  # the resource of which a worker has one
+PATIENCE = "30s"  # until a scheduler must have answered
+
+
+class OneTileAtATime(WorkerPlugin):
+    """Gives each worker, also those that join later, one tile to hold at a time."""
+
+    name = "lommel-one-tile-at-a-time"
+
+    async def setup(self, worker):
+        """Declare the resource, as Dask asks of a plugin."""
+        await worker.set_resources(**{TILE: 1})
+
+
+@contextmanager
+def submitted(solve, work, numbers, tiling):
+    """Hand tiles to a cluster.
+
+    Parameters
+    ----------
+    solve : function (work, number)
+        Found by its name on the workers.
+    work : Path
+        Folder of the tiles, on a disk that all workers see.
+    numbers : list of int
+    tiling : Tiling
+
+    Yields
+    ------
+    results : list of function ()
+        Each waits for its tile and gives what ``solve`` gives. `LommelError` when the scheduler is
+        lost.
+    """
+    with _cluster(tiling) as cluster, _client(cluster) as client:
+        client.register_plugin(OneTileAtATime())
+        run = uuid4().hex[:8]  # a tile that is tried again is a new task
+        futures = [
+            client.submit(
+                with_own_threads,
+                solve,
+                work,
+                number,
+                key=f"tile-{number}-{run}",
+                resources={TILE: 1},
+                pure=False,
+            )
+            for number in numbers
+        ]
+        yield [partial(_result, client, future, work) for future in futures]
+
+
+def check_scheduler(address):
+    """Refuse the address of a scheduler that does not answer; None stands for none.
+
+    Parameters
+    ----------
+    address : str or None
+    """
+    if address is not None:
+        _client(address).close()
+
+
+def with_own_threads(solve, work, number):
+    """Solve a tile with the threads of the worker this runs in, as ``solve`` does."""
+    threads = get_worker().state.nthreads
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+    return solve(work, number)
+
+
+def _cluster(tiling):
+    """Address of the cluster that was named, or one of this machine's own."""
+    if tiling.scheduler is not None:
+        return nullcontext(tiling.scheduler)
+    return LocalCluster(
+        n_workers=tiling.workers,
+        threads_per_worker=max(cores() // tiling.workers, 1),
+        memory_limit=0,  # the size of the tiles keeps to the memory
+        dashboard_address=None,
+    )
+
+
+def _client(cluster):
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # `_result` tells of losses
+    try:
+        return Client(cluster, timeout=PATIENCE)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"--dask-scheduler {cluster}: no scheduler answers there ({error}). Start one with "
+            "`dask scheduler`, and give the address it prints, like tcp://10.0.0.1:8786."
+        ) from error
+
+
+def _result(client, future, work):
+    try:
+        return future.result()
+    except Exception as error:
+        if client.status == "running":
+            raise
+        raise LommelError(
+            f"The Dask scheduler was lost while tiles were solved ({error}). Those that are done "
+            f"wait in {work}: the same command, with a scheduler that runs, goes on from there."
+        ) from error

@@ -1,0 +1,152 @@
+"""The products of a scene in tiles: blended window by window, with one record.
+
+Most callers want `finish_products`.
+"""
+
+from collections import Counter
+from dataclasses import asdict
+from types import SimpleNamespace
+
+import numpy as np
+
+from lommel.io.raster import raster_writer
+from lommel.run.inputs import Skipped
+from lommel.run.shape_from_shading import cell_grid, write_exposures
+from lommel.run.tiles_plan import blend_weights
+from lommel.run.tiles_records import part_folder, read_array, read_record
+from lommel.run.tiles_solve import stored_window
+
+PRODUCTS = {  # description and unit, as of a scene in one piece
+    "dem": ("height", "m"),
+    "initial-dem": ("height", "m"),
+    "measured": ("measured brightness", ""),
+    "modelled": ("modelled brightness", ""),
+    "albedo": ("albedo", ""),
+    "separation": ("slope signal left by a free albedo", "1"),
+    "residual": ("rms of modelled - measured", "percent"),
+    "hillshade-before": ("cosine of incidence", "1"),
+    "hillshade-after": ("cosine of incidence", "1"),
+}
+ON_POSTS = ("dem", "initial-dem")  # the others live on the cells between posts
+
+
+def finish_products(run, work, folder, record, known):
+    """Write rasters and ``exposures.csv`` from the tiles, and fill in the record of the run.
+
+    Parameters
+    ----------
+    run : TiledRun
+        All of whose tiles are done.
+    work : Path
+        Folder of the tiles.
+    folder : Path
+        That the products are written to.
+    record : RunRecord
+    known : Known
+    """
+    scene = read_record(work / "scene")
+    tiles = [read_record(part_folder(work, tile.number)) for tile in run.plan.tiles]
+    record.add_skipped([Skipped(**skip) for skip in scene["skipped"]])
+    sums = _write_products(folder, run.grid, run.plan, work)
+    fit = SimpleNamespace(
+        exposures=known.exposures, hazes=known.hazes, misfits=_misfits(known.names, tiles)
+    )
+    views = [SimpleNamespace(name=name) for name in known.names]
+    write_exposures(folder, views, record.skipped, fit)
+    record.results = _results(known, tiles, sums)
+    record.history = scene["history"]
+    record.outcome = _outcome(scene, tiles)
+    record.settings["tiles"] = [
+        _summary(tile, r) for tile, r in zip(run.plan.tiles, tiles, strict=True)
+    ]
+
+
+def _write_products(folder, grid, plan, work):
+    """Blend the tiles into rasters, window by window; sums for the results."""
+    cells, sums = cell_grid(grid), {}
+    for name, texts in PRODUCTS.items():
+        frame = grid if name in ON_POSTS else cells
+        with raster_writer(folder / f"{name}.tif", frame, *texts) as write:
+            for tile in plan.tiles:
+                window = tile.inner.intersection(frame.window)
+                if window.is_empty:
+                    continue
+                values = _blended(name, window, plan, work)
+                write(values, window)
+                if name == "dem":
+                    values = values - _blended("initial-dem", window, plan, work)
+                if name in ("dem", "residual"):
+                    count, total = sums.get(name, (0, 0.0))
+                    total += float(np.nansum(values.astype(float) ** 2))
+                    sums[name] = count + int(np.isfinite(values).sum()), total
+    return {name: (total / max(count, 1)) ** 0.5 for name, (count, total) in sums.items()}
+
+
+def _blended(name, window, plan, work):
+    """A product in a window: the tiles that reach it, each with its share."""
+    total, share = np.zeros(window.shape, np.float32), np.zeros(window.shape, np.float32)
+    for tile in plan.tiles:
+        kept = stored_window(tile, plan.shape)
+        common = window.intersection(kept)
+        if common.is_empty:
+            continue
+        values = read_array(part_folder(work, tile.number), name)[common.relative_to(kept).slices]
+        weights = np.where(np.isfinite(values), blend_weights(tile, common, plan.shape), 0)
+        inside = common.relative_to(window).slices
+        total[inside] += np.where(weights > 0, weights * values, 0)
+        share[inside] += weights
+    return np.where(share > 0, total / np.where(share > 0, share, 1), np.nan).astype(np.float32)
+
+
+def _misfits(names, tiles):
+    """Root mean square residual of each image over its tiles, in noise standard errors."""
+    totals, counts = np.zeros(len(names)), np.zeros(len(names))
+    for record in tiles:
+        for name, cells, misfit in zip(
+            record.get("images", []),
+            record.get("cells", []),
+            record.get("misfits", []),
+            strict=True,
+        ):
+            totals[names.index(name)] += cells * misfit**2
+            counts[names.index(name)] += cells
+    return np.sqrt(totals / np.maximum(counts, 1))
+
+
+def _results(known, tiles, sums):
+    solved = [record for record in tiles if "images" in record]
+    cells = [sum(record["cells"]) for record in solved]
+    mean = {
+        f"image_{name}": float(np.average([record[name] for record in solved], weights=cells))
+        for name in ("correlation_before", "correlation_after")
+        if sum(cells)
+    }
+    return {
+        "images": len(known.names),
+        "tiles": len(tiles),
+        **mean,
+        "image_residual_percent": sums["residual"],
+        "height_change_rms_m": sums["dem"],
+        "noise_percent": float(100 * np.mean(known.noise / known.brightness)),
+        "terrain_roughness_deg": float(np.degrees(known.priors.roughness)),
+        "albedo_contrast_percent": float(100 * known.priors.albedo_contrast),
+    }
+
+
+def _outcome(scene, tiles):
+    """The outcome that most tiles share; the worst that the whole scene shows comes first."""
+    if scene["outcome"] not in ("converged", "step_limit"):
+        return {"name": scene["outcome"], "sentence": scene["sentence"]}
+    counts = Counter(record["outcome"] for record in tiles)
+    listing = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.most_common())
+    solved = counts.copy()
+    del solved["unseen"]
+    name = "converged" if set(solved) <= {"converged"} else solved.most_common(1)[0][0]
+    return {"name": name, "sentence": f"{len(tiles)} tiles: {listing}."}
+
+
+def _summary(tile, record):
+    """What run.json tells of a tile."""
+    told = ("outcome", "sentence", "seconds", "peak_memory_mb", "images", "skipped")
+    kept = {name: record[name] for name in told if name in record}
+    return {"tile": tile.number, "window": asdict(tile.inner)} | kept

@@ -1,0 +1,50 @@
+"""Tiles on a Dask cluster: the bytes of a run without one, also when workers are lost."""
+
+import os
+import signal
+
+import pytest
+from distributed import LocalCluster
+
+from lommel.errors import InputError
+from lommel.run import tiles_dask
+from lommel.run.shape_from_shading import run_shape_from_shading
+from lommel.run.tiles_plan import Tiling, work_folder
+
+from .tiled_scene import SIDE, files_of, fingerprints
+
+
+def test_a_cluster_of_its_own_gives_the_same_bytes(half_done, tile_scene, tiled):
+    tiling = Tiling(engine="dask", side=SIDE)
+    run_shape_from_shading(files_of(tile_scene), half_done, tiling=tiling)
+    assert fingerprints(half_done) == fingerprints(tiled)
+    assert not work_folder(half_done).exists()
+
+
+def test_the_tile_of_a_worker_that_is_killed_goes_to_another(half_done, tile_scene, tiled):
+    killed = []
+    with LocalCluster(
+        n_workers=2, threads_per_worker=2, memory_limit=0, dashboard_address=None
+    ) as cluster:
+
+        def progress(items):
+            for done, item in enumerate(items):
+                if done == 2 and not killed:
+                    killed.append(cluster.workers[0].pid)
+                    os.kill(killed[0], signal.SIGKILL)
+                yield item
+
+        tiling = Tiling(engine="dask", side=SIDE, scheduler=cluster.scheduler_address)
+        run_shape_from_shading(files_of(tile_scene), half_done, tiling=tiling, progress=progress)
+    assert killed
+    assert fingerprints(half_done) == fingerprints(tiled)
+
+
+def test_a_scheduler_that_does_not_answer_is_named_before_anything_is_solved(
+    tile_scene, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(tiles_dask, "PATIENCE", "0.2s")
+    tiling = Tiling(engine="dask", side=SIDE, scheduler="tcp://127.0.0.1:9")
+    with pytest.raises(InputError, match="tcp://127.0.0.1:9: no scheduler answers"):
+        run_shape_from_shading(files_of(tile_scene), tmp_path / "out", tiling=tiling)
+    assert not list(tmp_path.iterdir())
