@@ -15,6 +15,10 @@ class InputError(LommelError):
     """The request was wrong: a value, a file or a combination of options that cannot work."""
 
 
+class UnreadableError(InputError):
+    """A file is not there, damaged, or of another kind than it was taken for."""
+
+
 class GeometryError(LommelError):
     """A whole image or tile cannot be placed on the body."""
 

@@ -24,7 +24,7 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.warp import reproject
 from rasterio.windows import Window as FileWindow
 
-from lommel.errors import InputError
+from lommel.errors import InputError, UnreadableError
 from lommel.scene.body import MOON
 from lommel.scene.grid import LEAST_SPACING, Grid, Window, read_crs
 
@@ -172,7 +172,7 @@ def read_pixels(path, window=None):
             if _has_mask_band(file):
                 missing |= file.read(2, window=part) == 0
         except GDAL_ERRORS as error:
-            raise InputError(f"{path} cannot be read, it may be truncated: {error}") from error
+            raise UnreadableError(f"{path} cannot be read, it may be truncated: {error}") from error
         scale, offset = file.scales[0], file.offsets[0]
     values = np.clip(values, -SPECIAL, SPECIAL, dtype=np.float32)
     values[missing | ~(np.abs(values) < SPECIAL)] = np.nan
@@ -321,7 +321,7 @@ def read_preview(path, size, body=MOON):
                 masked=True,
             ).filled(np.nan)
         except GDAL_ERRORS as error:
-            raise InputError(f"{path} cannot be read, it may be truncated: {error}") from error
+            raise UnreadableError(f"{path} cannot be read, it may be truncated: {error}") from error
         unit = file.units[0] or ""
     rows, cols = grid.shape
     affine = grid.affine @ Affine.scale(cols / shape[1], rows / shape[0])
@@ -418,7 +418,7 @@ def _refuse_full_disk(path, grid, dtype):
     free = shutil.disk_usage(path.parent).free
     if needed > free:
         raise InputError(
-            f"{path} needs up to {needed / 1e9:.1f} GB of disk, {free / 1e9:.1f} GB are free. "
+            f"{path} needs up to {needed / 1e9:.3g} GB of disk, {free / 1e9:.3g} GB are free. "
             "Free some, name another --output, or give a larger --spacing or narrower --bounds."
         )
 
@@ -460,7 +460,7 @@ def _open(path):
             return rasterio.open(_label(path))
     except GDAL_ERRORS as error:
         reason = "there is no such file" if not Path(path).exists() else str(error)
-        raise InputError(f"{path} cannot be opened as a raster: {reason}") from error
+        raise UnreadableError(f"{path} cannot be opened as a raster: {reason}") from error
 
 
 def _label(path):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lommel.errors import GeometryError, InputError, LommelError
+from lommel.errors import GeometryError, InputError, LommelError, UnreadableError
 from lommel.io.positions import find_position, read_positions
 from lommel.io.raster import raster_info, read_grid, read_image_on_grid, read_on_grid
 from lommel.scene.body import MOON
@@ -101,7 +101,15 @@ class Scene:
     skipped: list[Skipped]
 
 
-def read_scene(files, grid_settings=None, prefer="images", body=MOON, progress=iter, store=None):
+def read_scene(
+    files,
+    grid_settings=None,
+    prefer="images",
+    body=MOON,
+    progress=iter,
+    store=None,
+    is_part=False,
+):
     """Terrain and images on one grid.
 
     Parameters
@@ -116,6 +124,9 @@ def read_scene(files, grid_settings=None, prefer="images", body=MOON, progress=i
         Wraps the iterable of images, as ``rich.progress.track`` does.
     store : function (observation), optional
         Gives each observation back when it is read, its image perhaps stored elsewhere.
+    is_part : bool
+        The images have been read before, for all of the scene: one that cannot be read now is no
+        longer left out, but an `UnreadableError`.
 
     Returns
     -------
@@ -127,7 +138,7 @@ def read_scene(files, grid_settings=None, prefer="images", body=MOON, progress=i
         raise InputError("No DEM given. Name at least one with --dem.")
     tables = read_position_tables(files, body)
     dem_grids = [read_grid(path, body) for path in files.dems]
-    image_grids, skipped = place_images(files.images, dem_grids, body)
+    image_grids, skipped = place_images(files.images, dem_grids, body, is_part)
     if not image_grids:
         raise InputError("No image can be used.\n" + listing(skipped))
     grid = choose_grid(
@@ -141,7 +152,7 @@ def read_scene(files, grid_settings=None, prefer="images", body=MOON, progress=i
             seen = observe(path, image_grids[path], grid, heights, tables, body)
             observations.append(store(seen))
         except LommelError as error:
-            skipped.append(Skipped(path.name, str(error)))
+            skipped.append(left_out(path, error, is_part))
     if not observations:
         raise InputError("No image can be used.\n" + listing(skipped))
     return Scene(grid, heights, observations, skipped)
@@ -253,7 +264,14 @@ def _as_it_is(observation):
     return observation
 
 
-def place_images(paths, dem_grids, body):
+def left_out(path, error, is_part):
+    """`Skipped` for an image that failed, but not for a part of a scene that was read before."""
+    if is_part and isinstance(error, UnreadableError):
+        raise error
+    return Skipped(path.name, str(error))
+
+
+def place_images(paths, dem_grids, body, is_part=False):
     """Grid of each orthoimage that overlaps a DEM, and the `Skipped` others."""
     grids, skipped = {}, []
     for path in paths:
@@ -263,7 +281,7 @@ def place_images(paths, dem_grids, body):
                 raise GeometryError(f"{path.name} does not overlap the DEM.")
             grids[path] = grid
         except LommelError as error:
-            skipped.append(Skipped(path.name, str(error)))
+            skipped.append(left_out(path, error, is_part))
     return grids, skipped
 
 

@@ -19,7 +19,7 @@ from lommel.run.inputs import GridSettings
 from lommel.run.products import RunRecord, peak_memory_mb
 from lommel.run.tiles_engines import check_engine, solve_all
 from lommel.run.tiles_plan import Tiling, plan_tiles, work_folder
-from lommel.run.tiles_products import finish_products
+from lommel.run.tiles_products import finish_products, size_on_disk
 from lommel.run.tiles_records import (
     TiledRun,
     clear_partial,
@@ -30,6 +30,7 @@ from lommel.run.tiles_records import (
     part_folder,
     read_array,
     read_record,
+    refuse_full,
     remove_work,
     save_part,
     save_run,
@@ -181,16 +182,16 @@ def solve_part(work, number):
         run, part = load_run(work), part_folder(work, number)
         if is_done(part, run.digest):
             return None
-        start = time.perf_counter()
-        products, record = solve_tile(
-            run.files, run.grid, run.plan.tiles[number], load_known(work), run.settings
-        )
+        start, tile = time.perf_counter(), run.plan.tiles[number]
+        refuse_full(work, size_on_disk(tile, run.grid.shape))
+        products, record = solve_tile(run.files, run.grid, tile, load_known(work), run.settings)
         record |= {
             "digest": run.digest,
             "seconds": round(time.perf_counter() - start, 3),
             "peak_memory_mb": round(peak_memory_mb(), 1),
         }
-        save_part(part, products, record)
+        with disk_errors(part):
+            save_part(part, products, record)
     except Exception as error:  # whatever it is: the other tiles go on
         return str(error) if isinstance(error, LommelError) else f"{type(error).__name__}: {error}"
     return None

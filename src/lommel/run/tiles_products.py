@@ -30,6 +30,19 @@ PRODUCTS = {  # description and unit, as of a scene in one piece
 ON_POSTS = ("dem", "initial-dem")  # the others live on the cells between posts
 
 
+def size_on_disk(tile, shape):
+    """Bytes that the arrays of a tile take until all are done.
+
+    Parameters
+    ----------
+    tile : Tile
+    shape : tuple of int
+        Of the scene.
+    """
+    window = stored_window(tile, shape)
+    return np.dtype(np.float32).itemsize * len(PRODUCTS) * window.rows * window.cols
+
+
 def finish_products(run, work, folder, record, known):
     """Write rasters and ``exposures.csv`` from the tiles, and fill in the record of the run.
 

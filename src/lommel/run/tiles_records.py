@@ -75,8 +75,11 @@ def save_run(work, run):
     plan = {"side": run.plan.side, "stride": run.plan.stride}
     for name, content in ((RUN, pickle.dumps(run)), ("plan.json", json.dumps(plan).encode())):
         partial = work / f".{name}.{_me()}.partial"
-        partial.write_bytes(content)
-        partial.replace(work / name)
+        try:
+            partial.write_bytes(content)
+            partial.replace(work / name)
+        finally:
+            partial.unlink(missing_ok=True)
 
 
 def load_run(work):
@@ -193,10 +196,26 @@ def disk_errors(folder):
     try:
         yield
     except OSError as error:
+        free = shutil.disk_usage(next(f for f in (folder, *folder.parents) if f.exists())).free
         raise LommelError(
-            f"{folder} cannot be written: {error.strerror or error}. Make space or name another "
-            "--output; what is done is kept, and the same command goes on from there."
+            f"{folder} cannot be written: {error.strerror or error}; {free / 1e6:.1f} MB of its "
+            "disk are free. Make space; what is done is kept, and the same command goes on."
         ) from error
+
+
+def refuse_full(folder, size):
+    """Refuse to compute what the disk cannot take.
+
+    Parameters
+    ----------
+    folder : Path
+    size : int, bytes
+    """
+    free = shutil.disk_usage(folder).free
+    if free < size:
+        raise LommelError(
+            f"the disk of {folder} has {free / 1e6:.1f} MB free, {size / 1e6:.1f} MB are needed"
+        )
 
 
 def _me():

@@ -12,7 +12,7 @@ import numpy as np
 
 from lommel.core.multigrid import coarse_masses
 from lommel.core.reflectance import reflectance_model
-from lommel.errors import InputError, LommelError
+from lommel.errors import InputError, LommelError, UnreadableError
 from lommel.estimate.holes import fill_holes
 from lommel.estimate.measured_posts import measured_posts
 from lommel.estimate.priors import Priors
@@ -156,6 +156,8 @@ def _samples(files, grid, settings, thresholds):
         part = grid.cut(window)
         try:
             scene = read_views(files, part, settings.masks, thresholds=thresholds)
+        except UnreadableError:
+            raise
         except LommelError:
             continue  # no image or no terrain here; the others tell
         interpolated += measured_posts(scene.heights) is not None
@@ -280,6 +282,8 @@ def solve_tile(files, grid, tile, known, settings):
             settings.masks,
             thresholds=dict(zip(known.names, known.thresholds.tolist(), strict=True)),
         )
+    except UnreadableError:
+        raise
     except InputError as error:
         return _unseen(files, part, known, inside), {"outcome": "unseen", "sentence": str(error)}
     names = [view.name for view in scene.views]

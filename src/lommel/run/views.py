@@ -17,6 +17,7 @@ from lommel.run.inputs import (
     GridSettings,
     Skipped,
     choose_grid,
+    left_out,
     listing,
     place_images,
     read_heights,
@@ -75,7 +76,7 @@ def read_views(files, grid_settings=None, masks=None, body=MOON, progress=iter, 
         Wraps the iterable of images, as ``rich.progress.track`` does.
     thresholds : dict of str to float, image units, optional
         Shadow thresholds found on the whole scene, of which the grid is a part: of raw images
-        only what falls on it is read.
+        only what falls on it is read, and one that cannot be read any more is an error.
 
     Returns
     -------
@@ -83,11 +84,12 @@ def read_views(files, grid_settings=None, masks=None, body=MOON, progress=iter, 
     """
     refuse_duplicates(files.images)
     grid_settings = grid_settings or GridSettings()
-    cameras = _camera_files(files)
+    cameras, is_part = _camera_files(files), thresholds is not None
     flat = tuple(path for path in files.images if path not in cameras)
     views, skipped = [], []
     if flat:
-        scene = read_scene(replace(files, images=flat), grid_settings, "dem", body, progress)
+        only_flat = replace(files, images=flat)
+        scene = read_scene(only_flat, grid_settings, "dem", body, progress, is_part=is_part)
         grid, heights, skipped = scene.grid, scene.heights, list(scene.skipped)
         views = [
             (OrthoView(observation), observation.saturation)
@@ -102,12 +104,10 @@ def read_views(files, grid_settings=None, masks=None, body=MOON, progress=iter, 
     for path in progress(list(cameras)) if cameras else ():
         try:
             views.append(
-                _camera_view(
-                    path, cameras[path], suns, files, grid, heights, body, thresholds is not None
-                )
+                _camera_view(path, cameras[path], suns, files, grid, heights, body, is_part)
             )
         except LommelError as error:
-            skipped.append(Skipped(path.name, str(error)))
+            skipped.append(left_out(path, error, is_part))
     order = {path.name: number for number, path in enumerate(files.images)}
     views.sort(key=lambda pair: order[pair[0].name])
     if thresholds is None:

@@ -1,0 +1,75 @@
+"""What goes wrong while tiles are solved: a full disk, an image that breaks."""
+
+import os
+import shutil
+import subprocess
+
+import pytest
+
+from lommel.errors import LommelError
+from lommel.run.shape_from_shading import run_shape_from_shading
+from lommel.run.tiles import solve_part
+from lommel.run.tiles_plan import Tiling, work_folder
+from lommel.run.tiles_records import disk_errors, is_done, load_run, part_folder, read_record
+
+from .tiled_scene import SIDE, files_of, fingerprints
+
+TILING = Tiling(side=SIDE)
+
+
+def mount(folder, options):
+    if shutil.which("mount") is None or os.geteuid() != 0:
+        pytest.skip("needs the right to mount a small disk")
+    command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        pytest.skip(f"no small disk can be mounted here: {done.stderr.strip()}")
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount(folder, "size=64m")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_run_goes_on_when_a_full_disk_has_room_again(half_done, small_disk, tile_scene, tiled):
+    output = small_disk / "out"
+    shutil.move(work_folder(half_done), work_folder(output))
+    used = shutil.disk_usage(small_disk).used
+    mount(small_disk, f"remount,size={used + 200_000}")
+    message = r"4 of 9 tiles failed.*\n  tile 1: the disk of .* has 0\.2 MB free, 1\.\d MB are"
+    with pytest.raises(LommelError, match=message):
+        run_shape_from_shading(files_of(tile_scene), output, tiling=TILING)
+    assert not output.exists()
+    mount(small_disk, "remount,size=64m")
+    run_shape_from_shading(files_of(tile_scene), output, tiling=TILING)
+    assert fingerprints(output) == fingerprints(tiled)
+
+
+def test_what_the_disk_refuses_is_told_in_words(tmp_path):
+    with (
+        pytest.raises(LommelError, match=r"not-made cannot be written: too full; \d.* MB"),
+        disk_errors(tmp_path / "not-made"),
+    ):
+        raise OSError(28, "too full")
+
+
+@pytest.mark.parametrize("damage", ["gone", "truncated"])
+def test_a_tile_fails_when_its_image_breaks_and_is_not_solved_without_it(
+    half_done, tile_scene, damage
+):
+    image, work = tile_scene / "img2.tif", work_folder(half_done)
+    aside = image.rename(tile_scene / "aside")
+    try:
+        if damage == "truncated":
+            image.write_bytes(aside.read_bytes()[:4000])
+        assert str(image) in solve_part(work, 1)
+        assert not part_folder(work, 1).exists()
+    finally:
+        aside.replace(image)
+    assert solve_part(work, 1) is None
+    assert is_done(part_folder(work, 1), load_run(work).digest)
+    assert read_record(part_folder(work, 1))["images"] == ["img1.tif", "img2.tif"]
