@@ -149,9 +149,13 @@ def named_files(files, names):
 
 
 def _samples(files, grid, settings, thresholds):
-    """Names and solution of each window at full resolution, the scene's middle first."""
+    """Names and solution of each window at full resolution, the scene's middle first.
+
+    Its priors hold for the next ones, as they will for the tiles; only an image that no window
+    before has seen needs the estimate of its noise.
+    """
     windows = _sample_windows(grid.shape)
-    found, interpolated = [], 0
+    found, interpolated, noise = [], 0, {}
     for window in windows:
         part = grid.cut(window)
         try:
@@ -166,17 +170,22 @@ def _samples(files, grid, settings, thresholds):
         camera = scene.views[0].position if settings.parametrisation == "ray" else None
         surface = Surface(part, float(np.mean(initial, dtype=float)), camera)
         albedo, photometry = read_known(settings.albedo, settings.exposures, cell_grid(part), names)
+        priors = settings.priors
+        if set(names) <= set(noise):
+            priors = replace(found[0][1].priors, noise=np.array([noise[name] for name in names]))
         solution = solve_surface(
             surface,
             surface.posts_from_heights(initial),
             scene.views,
             reflectance_model(settings.reflectance),
-            settings.priors,
+            priors,
             settings.solver,
             albedo,
             photometry,
         )
         found.append((names, solution.value))
+        own = zip(names, solution.value.priors.noise, strict=True)
+        noise = dict(own) | noise  # the first window that sees an image tells
     if not found:
         raise InputError(
             "None of the windows at full resolution that tell noise and exposures holds an image "
