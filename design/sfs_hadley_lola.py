@@ -2,7 +2,8 @@
 
 The image is registered once, to the DEM of all dates. Then, fold by fold, the shots of a few dates
 are left out of a linear interpolation of the others, `lommel sfs` refines that DEM from the image
-without any option, and both are compared with the shots left out.
+without any option, and both are compared with the shots left out, also by their distance to shots
+that were used: gaps get wider than those of the whole set.
 
     python design/sfs_hadley_lola.py FOLDER [DATES_PER_FOLD]
 
@@ -16,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
 
 from lommel.io.raster import read_grid, read_pixels, write_raster
 from lommel.run.inputs import SceneFiles
@@ -23,6 +25,7 @@ from lommel.run.register import run_register
 from lommel.run.shape_from_shading import run_shape_from_shading
 
 IMAGE = "AS15-M-1134-hadley"
+REACHES = (10, 20, 30, 40)  # posts
 SEED = 5  # of the order in which dates are left out
 
 
@@ -53,10 +56,14 @@ def main(folder, dates_per_fold=3):
                 overwrite=True,
             )
             left = out & inside
-            results.append(_errors(work, places[:, left], shots["height_m"][left]))
+            distance = cKDTree(places[:, ~out].T).query(places[:, left].T)[0]
+            results.append(_errors(work, places[:, left], shots["height_m"][left], distance))
             print(", ".join(dates[first : first + dates_per_fold]), _words(results[-1]), flush=True)
-    before, after, seen = np.concatenate(results, axis=1)
+    before, after, seen, distance = np.concatenate(results, axis=1)
     print("all:", _words((before, after)))
+    for reach in REACHES:
+        part = distance <= reach
+        print(f"within {reach} posts of a shot that was used:", _words((before[part], after[part])))
     for name, part in (("seen by the image:", seen > 0), ("not seen:", seen == 0)):
         print(name, _words((before[part], after[part])))
 
@@ -66,8 +73,8 @@ def _interpolated(grid, places, shots, kept):
     return surface(*np.indices(grid.shape)).astype(np.float32)
 
 
-def _errors(work, places, heights):
-    """Errors before and after, m, and whether the image sees the place."""
+def _errors(work, places, heights, distance):
+    """Errors before and after, m, whether the image sees the place, and how far it is, posts."""
     before, after = (
         map_coordinates(read_pixels(work / name), places, order=1) - heights
         for name in ("dem.tif", "sfs/dem.tif")
@@ -75,7 +82,7 @@ def _errors(work, places, heights):
     seen = np.isfinite(read_pixels(work / "sfs/measured.tif")).astype(float)
     seen = map_coordinates(seen, places - 0.5, order=0, mode="nearest")
     known = np.isfinite(before) & np.isfinite(after)
-    return np.stack([before, after, seen])[:, known]
+    return np.stack([before, after, seen, distance])[:, known]
 
 
 def _words(errors):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from lommel.core.normal_operator import (
+    add_slopes,
     LARGEST_EIGENVALUE,
     apply_operator,
     coarse_shape,
@@ -112,6 +113,9 @@ def test_slope_adjoint_is_the_transpose_of_the_differences():
     slope_adjoint(gp, gq, out)
     p, q = slope_differences(u)
     assert np.vdot(out, u) == pytest.approx(np.vdot(gp, p) + np.vdot(gq, q), abs=1e-3)
+    slopes = np.ones((16, 22), np.float32)
+    add_slopes(gp, gq, u, slopes)
+    np.testing.assert_allclose(slopes, 1 + gp * p + gq * q, atol=1e-5)  # float32 rounding
 
 
 @pytest.mark.parametrize("shape", SHAPES)

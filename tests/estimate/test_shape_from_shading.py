@@ -307,16 +307,27 @@ def test_known_albedo_and_exposures_are_held_and_used():
     assert rms(told.u - truth) < 0.8 * rms(alone.u - truth)
 
 
-def test_gaps_between_altimeter_tracks_are_filled_from_one_image():
-    """Tracks 30 posts apart, linear interpolation between them, light across the tracks."""
+@pytest.mark.parametrize(
+    ("azimuths", "share", "likeness"), [((95.0,), 0.25, 0.7), ((95.0, 150.0), 0.05, 0.99)]
+)
+def test_gaps_between_altimeter_tracks_are_filled_on_patchy_ground(azimuths, share, likeness):
+    """Tracks 30 posts apart, light across them, albedo 5 % rms, which two Suns tell from relief."""
     truth, _ = rough_scene()
     grid = patch_grid(*truth.shape)
     dem, _ = triangulated(truth, range(2, truth.shape[1], 30))
     dem = np.where(np.isfinite(dem), dem, truth.mean()).astype(np.float32)
-    view = simulated_views(truth, grid, (95.0,))[0]
+    patches = 1 + 0.05 * hills(grid.shape, seed=5, smooth=15.0, rms=1.0)
+    views = [
+        view.with_image((factor * view.image * patches).astype(np.float32))
+        for factor, view in zip((1.0, 1.4), simulated_views(truth, grid, azimuths), strict=False)
+    ]
     measured = measured_posts(dem)
     start = fill_holes(np.where(measured, dem, np.nan).astype(np.float32))
-    solution = solve_surface(
-        Surface(grid, 0.0), start, [view], reflectance_model(), measured=measured
-    )
-    assert rms(solution.value.u - truth) < 0.35 * rms(dem - truth)
+    found = solve_surface(
+        Surface(grid, 0.0), start, views, reflectance_model(), measured=measured
+    ).value
+    assert rms(found.u - truth) < share * rms(dem - truth)
+    albedo = (patches[1:, 1:] + patches[:-1, :-1]) / 2
+    assert np.corrcoef(found.albedo.ravel(), albedo.ravel())[0, 1] > likeness
+    if len(views) == 2:
+        assert found.exposures[1] / found.exposures[0] == pytest.approx(1.4, rel=0.01)

@@ -231,6 +231,25 @@ def slope_adjoint(gp, gq, out):
                 row[c + 1] += half * (gq[r - 1, c] + gp[r - 1, c])
 
 
+@njit(cache=True, parallel=True)
+def add_slopes(wp, wq, u, out):
+    """``out += (wp, wq) D u``: the weighted slopes of cells, the adjoint of `slope_adjoint`.
+
+    Parameters
+    ----------
+    wp, wq : float32 array (rows - 1, cols - 1)
+    u : float32 array (rows, cols)
+    out : float32 array (rows - 1, cols - 1)
+    """
+    half = np.float32(0.5)
+    for i in prange(out.shape[0]):
+        r = np.int64(i)
+        for c in range(out.shape[1]):
+            down = half * (u[r + 1, c + 1] - u[r, c])
+            up = half * (u[r, c + 1] - u[r + 1, c])
+            out[r, c] += wp[r, c] * (down + up) + wq[r, c] * (down - up)
+
+
 def coarse_shape(shape):
     """Posts of the next coarser grid: every second one, and one beyond an even end."""
     return shape[0] // 2 + 1, shape[1] // 2 + 1

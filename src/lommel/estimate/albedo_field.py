@@ -20,6 +20,9 @@ REDUCTION = 0.1  # of the linear residual per reweighting: leaves errors below t
 MAX_CYCLES = 8
 REWEIGHTINGS = 3  # the first is least squares; two more settle the borders
 EDGE = 3.0  # times the expected difference: a border of units from there on
+# Share of the stiffness against the twist of four cells: slopes at their centre do not feel a
+# checkerboard
+TWIST = 0.25
 
 
 def albedo_information(shape, images):
@@ -65,9 +68,64 @@ def fit_albedo(weight, pull, contrast, start):
     albedo = start
     stiffness = np.full((start.shape[0] - 1, start.shape[1] - 1), contrast**-2.0, np.float32)
     for _ in range(REWEIGHTINGS):
-        albedo = albedo + _step(albedo, weight, pull, stiffness)
-        stiffness = _reweighted(albedo, contrast)
+        equations = smoothness_equations(stiffness, contrast, weight)
+        image = np.empty_like(albedo)
+        equations.apply(albedo, image)
+        albedo = albedo + conjugate_gradients(equations, pull - image, REDUCTION, MAX_CYCLES).x
+        stiffness = albedo_stiffness(albedo, contrast)
     return albedo
+
+
+def smoothness_equations(stiffness, contrast, weight):
+    """Normal equations of an albedo that is smooth, and measured with a weight.
+
+    Parameters
+    ----------
+    stiffness : float32 array (rows - 1, cols - 1)
+        From `albedo_stiffness`.
+    contrast : float, dimensionless
+    weight : float32 array (rows, cols)
+
+    Returns
+    -------
+    equations : NormalEquations
+    """
+    none = np.zeros_like(stiffness)
+    twist = np.array([0.0, TWIST * contrast**-2.0, 0.0])
+    return NormalEquations((stiffness, none, stiffness), twist, [0.0], posts=weight)
+
+
+def albedo_stiffness(albedo, contrast):
+    """Stiffness between cells under the pseudo-Huber loss: softer across borders of units.
+
+    Parameters
+    ----------
+    albedo : float32 array (rows, cols)
+    contrast : float, dimensionless
+
+    Returns
+    -------
+    stiffness : float32 array (rows - 1, cols - 1)
+    """
+    return np.float32(contrast**-2.0) / np.sqrt(1 + _squared_slope(albedo, contrast))
+
+
+def smoothness_cost(albedo, contrast):
+    """Half of what an albedo's differences cost; its gradient is that of `smoothness_equations`.
+
+    Parameters
+    ----------
+    albedo : float32 array (rows, cols)
+    contrast : float, dimensionless
+
+    Returns
+    -------
+    cost : float
+    """
+    slope = np.sqrt(1 + _squared_slope(albedo, contrast)) - 1
+    twist = np.diff(np.diff(albedo, axis=0), axis=1)
+    twisted = TWIST * contrast**-2.0 / 2 * np.sum(twist**2, dtype=float)
+    return float(EDGE**2 * slope.sum(dtype=float) + twisted)
 
 
 def observed_contrast(weight, pull):
@@ -92,21 +150,9 @@ def observed_contrast(weight, pull):
     return float(max(mean - 2 * np.nanmean(1 / seen), 0.0) ** 0.5)
 
 
-def _step(albedo, weight, pull, stiffness):
-    """Change of the albedo that ends the least-squares problem with the given stiffness."""
-    none = np.zeros_like(stiffness)
-    # the centre slopes of 2x2 cells do not feel a checkerboard; their twist does
-    twist = np.array([0.0, float(np.median(stiffness)) / 4, 0.0])
-    equations = NormalEquations((stiffness, none, stiffness), twist, [0.0], posts=weight)
-    image = np.empty_like(albedo)
-    equations.apply(albedo, image)
-    return conjugate_gradients(equations, pull - image, REDUCTION, MAX_CYCLES).x
-
-
-def _reweighted(albedo, contrast):
-    """Stiffness between cells under the pseudo-Huber loss: softer across borders of units."""
+def _squared_slope(albedo, contrast):
+    """Squared difference of neighbouring cells, in units of a border's."""
     half = np.float32(0.5)
     along = half * (np.diff(albedo, axis=1)[1:] + np.diff(albedo, axis=1)[:-1])
     across = half * (np.diff(albedo, axis=0)[:, 1:] + np.diff(albedo, axis=0)[:, :-1])
-    square = (along**2 + across**2) / np.float32((EDGE * contrast) ** 2)
-    return np.float32(contrast**-2.0) / np.sqrt(1 + square)
+    return (along**2 + across**2) / np.float32((EDGE * contrast) ** 2)

@@ -37,6 +37,7 @@ SLOPE_STEP = 0.01  # for the change of brightness with slope: R bends little ove
 HAZE_ERROR = 0.1  # of the mean brightness: scattered light and film base are not more
 LOWEST_SUN = 0.01  # sine of the elevation below which shadows are not followed any longer
 DARK = 0.5  # of the median brightness: the image itself denies a shadow that is brighter
+NOT_COUPLED = np.empty((4, 0, 0), np.float32)
 HUBER_SCALE = 3.0  # noise standard errors from which a residual counts as an outlier
 
 
@@ -84,6 +85,7 @@ class Problem:
     slope: np.ndarray
     expected: np.ndarray
     albedo_error: float = 0.0
+    couples_albedo: bool = False
     pins: np.ndarray | None = None
     pinned: np.ndarray | None = None
     shadows: list = field(default_factory=list)
@@ -152,8 +154,14 @@ class Problem:
                 tensors,
                 gradient,
                 best,
+                self.coupling if self.couples_albedo else NOT_COUPLED,
             )
         return tensors, gradient, sums, best, albedo_cost
+
+    @property
+    def coupling(self):
+        """What tied albedo and slopes at the last assembly: `assemble`'s array (4, ...)."""
+        return self._array("coupling", (4, *self.albedo.shape))
 
     def _spacing(self):
         return np.array(self.surface.grid.spacing, np.float32) * np.float32(self.stride)
@@ -233,6 +241,7 @@ class Problem:
         self.expected = np.full_like(self.initial, self.initial.mean(dtype=float))
         self.masses = np.zeros(1)
         self.slope = np.zeros(2, np.float32)
+        self.albedo_error = 0.0
 
     def hold(self, posts, weight):
         """Hold posts at given values, besides those that are pinned already.
@@ -296,6 +305,20 @@ class Problem:
                 cast_shadow(u, rays, lattice.step, u.max(), cells, darkest, shadow)
             self.shadows.append(widened(shadow))
             cells[self.shadows[-1]] = np.nan
+
+    def single_image(self, k):
+        """The same level as image ``k`` alone sees it, with memory of its own."""
+        *geometry, lights = self.geometry
+        return replace(
+            self,
+            views=self.views[k : k + 1],
+            exposures=self.exposures[k : k + 1],
+            hazes=self.hazes[k : k + 1],
+            weights=self.weights[k : k + 1],
+            cells=self.cells[k : k + 1],
+            geometry=[*geometry, lights[k : k + 1]],
+            memory={},
+        )
 
     def coarser(self):
         """The same problem on every second post."""

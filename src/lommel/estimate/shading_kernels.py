@@ -220,6 +220,7 @@ def assemble(
     tensors,
     gradient,
     best,
+    coupling,
 ):
     """Reduce the images to the normal equations of the slopes.
 
@@ -255,6 +256,9 @@ def assemble(
         Gets that of half the cost with respect to the differences.
     best : float32 array (rows - 1, cols - 1)
         Gets the albedo that fits best; not written when it is known.
+    coupling : float32 array (4, rows - 1, cols - 1) or (4, 0, 0)
+        Gets what ties the albedo to the differences of heights, its own second derivative and its
+        gradient, for equations that keep it as an unknown.
 
     Returns
     -------
@@ -296,6 +300,8 @@ def assemble(
                     )
                 if precision >= 0:
                     costs[block] += _eliminate_albedo(albedo[r, a:], precision, w, n, best[r, a:])
+                for k in range(4 if coupling.shape[1] else 0):
+                    _copy(w, AP + k * LONGEST, coupling[k, r, a:], n)
                 _copy(w, GPP, tensors[0, r, a:], n)
                 _copy(w, GPQ, tensors[1, r, a:], n)
                 _copy(w, GQQ, tensors[2, r, a:], n)

@@ -23,7 +23,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lommel.core.least_squares import Solution
+from lommel.core.least_squares import (
+    ATTEMPTS,
+    ROUNDING,
+    Solution,
+    less_damping,
+    more_damping,
+    stiffen,
+)
 from lommel.core.multigrid import NormalEquations, conjugate_gradients, dot
 from lommel.core.normal_operator import prolong_add
 from lommel.estimate.albedo_field import (
@@ -34,20 +41,16 @@ from lommel.estimate.albedo_field import (
 from lommel.estimate.priors import Priors, PriorSettings, estimate_priors
 from lommel.estimate.problem import best_photometry, coarse_posts, exposure_gain, fresh_problem
 from lommel.estimate.shading_kernels import SUM_COUNT, SUM_RR
+from lommel.estimate.surface_and_albedo import solve_jointly
 
 COARSEST = 24  # posts along the shorter side of the coarsest level that sees the images
 COARSE_STEPS = 4  # Gauss-Newton steps per coarse level at most; 2 on the largest of them
 ENOUGH_CELLS = 100_000  # of them tell a correlation to (1 - r^2) 0.3 %
-ATTEMPTS = 6  # per step, each damped more: a cost that still rises has no way down
-LEAST_DAMPING, DAMPING_FACTOR = 0.1, 5.0  # first try, and factor to the next
 EXPOSURE_GAIN = 1e-4  # relative, of the cost: exposures that gain less wait for the next step
-ROUNDING = 1e-5  # relative, of a cost summed from float32 residuals
 EXPLAINED = 0.5  # noise standard errors, rms: a surface that leaves less leaves nothing to albedo
 # Where interpolation hides how far a DEM errs, albedo cannot be read off the images beforehand:
 # units that differ by a tenth or two border on each other over some ten posts
 PATCHY = 0.01
-ALBEDO_ROUNDS = 10  # of albedo and surface in turn, at most
-SETTLED = 0.1  # of the change in all rounds: one that changes less ends them
 CELL_UNKNOWNS = 3  # two slopes and the albedo: what a cell's values determine
 POOR_FIT = 2.5  # noise standard errors, rms: more is not noise
 POOR_START = 0.25  # of the brightness taken for noise: the initial DEM explains nothing
@@ -220,13 +223,20 @@ def solve_surface(
         for k, cells in enumerate(finest.cells)
     ]
     history: list[dict] = []
-    u, converged = _coarse_to_fine(finest, settings, history, start)
-    if measured is not None and settings.estimate_albedo:
-        u, converged = _part_albedo(finest, u, priors, settings, history)
+    is_joint = measured is not None and settings.estimate_albedo
+    if is_joint:
+        u, converged = finest.initial, False
+        for _ in range(2):  # shadows of the smooth start are not those of the relief found
+            finest.prepare_geometry(u)
+            finest.sample_images(u)
+            finest.find_shadows(u)
+            u, converged = solve_jointly(finest, u, priors.albedo_contrast, settings, history)
+    else:
+        u, converged = _coarse_to_fine(finest, settings, history, start)
     sums = finest.assemble(u)[2]
     misfits = np.sqrt(sums[:, SUM_RR] / np.maximum(sums[:, SUM_COUNT], 1))
     left = misfits if start is None else start.misfits
-    if settings.estimate_albedo and left.max() > EXPLAINED:
+    if settings.estimate_albedo and not is_joint and left.max() > EXPLAINED:
         _fit_albedo(finest, u, priors, left, settings)
     modelled = [finest.predict(u, k) for k in range(len(views))]
     value = SurfaceSolution(
@@ -337,7 +347,7 @@ def _descend(level, u, steps, settings, history):
             cost = _best_cost(here, level, settings)
             if cost <= last * (1 + ROUNDING):
                 break
-            damping = max(DAMPING_FACTOR * damping, LEAST_DAMPING)
+            damping = more_damping(damping)
             u, here = start, _look(level, start)
         else:  # no way down: stay
             return start, _is_small(step, start, level, settings)
@@ -360,39 +370,8 @@ def _descend(level, u, steps, settings, history):
         is_done = next_gain < settings.gain_tolerance * abs(cost)
         if damping == 0 and (is_done or _is_small(u - start, u, level, settings)):
             return u, True
-        damping = damping / DAMPING_FACTOR if damping > LEAST_DAMPING else 0.0
+        damping = less_damping(damping)
     return u, False
-
-
-def stiffen(tensors, damping):
-    """Resist changes of slope with a share ``damping`` of the images' mean resistance.
-
-    Parameters
-    ----------
-    tensors : float32 array (3, rows - 1, cols - 1)
-        Changed in place.
-    damping : float, dimensionless
-    """
-    if damping > 0:
-        mean = (tensors[0].mean(dtype=float) + tensors[2].mean(dtype=float)) / 2
-        tensors[0] += np.float32(damping * mean)
-        tensors[2] += np.float32(damping * mean)
-
-
-def _part_albedo(level, u, priors, settings, history):
-    """Albedo and surface in turn, until they leave each other alone.
-
-    Measured posts fix the mean slopes between them. What an image shows beyond these on long waves
-    is albedo; taken out of the image, it no longer bends the surface.
-    """
-    converged, before = False, u
-    for _ in range(ALBEDO_ROUNDS):
-        _fit_albedo(level, u, priors, np.ones(len(level.views)), settings)
-        last = u
-        u, converged = _descend(level, u, settings.max_steps, settings, history)
-        if _rms(u - last) < SETTLED * _rms(u - before):
-            break
-    return u, converged
 
 
 def _exposures_are_off(here, level):
