@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from lommel.core.normal_operator import (
-    add_slopes,
     LARGEST_EIGENVALUE,
+    add_slopes,
     apply_operator,
     coarse_shape,
     coarsen_cells,

@@ -11,8 +11,8 @@ unknowns of one linear system,
 with `A` the normal operator of the heights (`lommel.core.multigrid`), `P` that of the albedo
 (`lommel.estimate.albedo_field`), each with its own V-cycle as preconditioner, and `C` what the
 images leave to tie them, cell by cell. The few exposures and hazes are eliminated by one more solve
-each. Haze is not negative: relief that is too flat under too high an exposure fits as well and costs
-the prior less, which nothing but this bound stops. Most callers want `solve_jointly`.
+each. Haze is not negative: relief that is too flat under too high an exposure fits as well and
+costs the prior less, which nothing but this bound stops. Most callers want `solve_jointly`.
 """
 
 from dataclasses import dataclass
