@@ -194,7 +194,7 @@ def test_haze_is_found_where_it_differs():
     result = estimate_albedo(scene.observations, scene.grid, scene.heights, settings)
     assert np.corrcoef(result.hazes, scene.hazes)[0, 1] > 0.9
     without = estimate_albedo(scene.observations, scene.grid, scene.heights, EXACT)
-    assert result.disagreement < 0.7 * without.disagreement
+    assert result.disagreement < 0.75 * without.disagreement
 
 
 def test_phase_factor_and_falloff_are_found():

@@ -22,32 +22,27 @@ mean albedo that image k alone sees, about its mean over the images.
 `estimate_albedo`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse.linalg import splu
 
-from lommel.core.least_squares import Solution
 from lommel.core.reflectance import reflectance_model
 from lommel.errors import InputError
-from lommel.estimate.albedo_arrays import OWN, SHARED, State
+from lommel.estimate.albedo_arrays import OWN, SHARED
+from lommel.estimate.albedo_cells import cells_of
 from lommel.estimate.albedo_equations import (
-    PIN,
     Problem,
     connected_groups,
-    effective_repetition,
     noise_scale,
-    normal_equations,
     standard_errors,
     visit,
 )
 from lommel.estimate.albedo_maps import LastPass, MapRows, WholeMaps
 from lommel.estimate.albedo_samples import SampleBlocks, overlapping_pairs
 from lommel.estimate.albedo_settings import AlbedoSettings, check_settings
+from lommel.estimate.albedo_solver import solve, weighting
 
-SETTLED = 0.02  # change of the log noise scale from which scale and repetition are kept
-SETTLING = 8  # passes at most until then; from there on the cost keeps its meaning
-LONGEST = 0.5  # change of any unknown in one step; all are logarithms or of order 1
+WEIGHINGS = 2  # passes over all posts that tell the noise scale, once exposures come from cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,9 +128,9 @@ def estimate_albedo(observations, grid, heights, settings=None, progress=None, t
     if not len(blocks.levels):
         listing = [f"  {o.name}: {r}" for o, r in zip(observations, blocks.reasons, strict=True)]
         raise InputError("No image can be used.\n" + "\n".join(listing[:20]))
-    problem = _pose(blocks, settings)
-    solution, passes = _iterate(problem, progress or (lambda *_: None))
-    return _result(problem, solution, passes + 1, take)
+    cells = cells_of(blocks) if settings.solver == "projection" else blocks
+    problem, solution = solve(_pose(cells, settings), progress or (lambda *_: None))
+    return _result(problem, solution, replace(problem, blocks=blocks), take)
 
 
 def _pose(blocks, settings):
@@ -151,105 +146,35 @@ def _pose(blocks, settings):
     return Problem(blocks, overlapping_pairs(blocks.windows), settings, is_fitted, start)
 
 
-def _iterate(problem, progress):
-    """Steps until the cost stays; the solution, its value the last point, and how many passes."""
-    settings, levels = problem.settings, problem.blocks.levels
-    state = State(
-        levels / levels.mean(),
-        np.zeros(problem.images),
-        problem.blocks.brightness,
-        problem.shared_start,
-    )
-    point = visit(problem, state, np.log(levels.mean()), 1.0, 1.0)
-    is_settled = settings.solver == "alternating" and settings.loss == "least-squares"
-    damping, history, change = 0.0, [], np.inf
-    for step in range(settings.max_steps):
-        scale, repetition = point.scale, point.repetition
-        if not is_settled:
-            scale, repetition = _weighting(point)
-            is_settled = abs(np.log(scale / point.scale)) < SETTLED or step >= SETTLING
-            repetition = repetition if is_settled else 1.0
-        moved, mean = _step(problem, point, damping)
-        trial = visit(problem, moved, mean, scale, repetition)
-        progress(step + 1, trial.objective)
-        if (scale, repetition) != (point.scale, point.repetition):
-            point = trial  # the cost has changed its meaning
-            continue
-        change = (trial.objective - point.objective) / max(abs(point.objective), 1e-300)
-        if change <= 0:
-            point, damping = trial, damping / 4
-        else:
-            damping = max(4 * damping, 1e-3)
-        history.append({"step": step + 1, "cost": point.objective, "change": change})
-        if abs(change) < settings.tolerance:
-            advice = f"Converged after {step + 1} steps."
-            return Solution(point, "converged", advice, history), step + 2
-    advice = (
-        f"Stopped after {settings.max_steps} steps while the cost still changed by "
-        f"{100 * abs(change):.2g} % per step; raise max_steps."
-    )
-    return Solution(point, "step_limit", advice, history), settings.max_steps + 1
+def _result(solved, solution, problem, take):
+    """Bring the gauge to mean exposure 1, and collect; the last pass leaves the maps.
 
-
-def _weighting(point):
-    """Noise scale and repetition that the residuals show; 1 where one image shows none."""
-    scale = noise_scale(point.sums.histogram)
-    return scale if np.isfinite(scale) else 1.0, effective_repetition(point.sums)
-
-
-def _step(problem, point, damping):
-    """The next state and mean log albedo."""
-    change = np.zeros(problem.is_fitted.size)
-    if problem.settings.solver == "alternating":
-        change[: OWN * problem.images] = _published_step(problem, point)
-    else:
-        matrix, gradient = normal_equations(problem, point)
-        fitted = np.flatnonzero(problem.is_fitted)
-        matrix = matrix[fitted][:, fitted].tocsc()
-        matrix.setdiag(matrix.diagonal() * (1.0 + damping + PIN))
-        change[fitted] = -splu(matrix).solve(gradient[fitted])
-        change *= min(1.0, LONGEST / np.abs(change).max())
-    own = change[: OWN * problem.images].reshape(-1, OWN)
-    state = point.state
-    exposure = state.exposure * np.exp(own[:, 0])
-    if problem.settings.solver == "alternating":  # step 3 is linear in T
-        exposure = state.exposure * (1.0 + own[:, 0])
-    shared = state.shared + change[-SHARED - 1 : -1]
-    shared[1] = max(shared[1], 0.0)  # a negative c2 could make the brightness negative
-    moved = State(exposure, state.haze + state.level * own[:, 1], state.level, shared)
-    return moved, point.mean_log_albedo + change[-1]
-
-
-def _published_step(problem, point):
-    """Step 3 of the albedo paper, for exposure and, on request, haze: albedo held fixed."""
-    own, gradient = point.sums.own, point.sums.gradient
-    change = np.zeros_like(gradient)
-    if problem.settings.haze:
-        square = own + np.triu(own, 1).transpose(0, 2, 1)
-        change = -np.linalg.solve(square, gradient[..., None])[..., 0]
-    else:
-        change[:, 0] = -gradient[:, 0] / own[:, 0, 0]
-    return change.ravel()
-
-
-def _result(problem, solution, passes, take):
-    """Bring the gauge to mean exposure 1, and collect; one more pass leaves the maps."""
+    ``solved`` is the problem on the cells that the solution belongs to, ``problem`` the same on all
+    posts.
+    """
     point, reasons = solution.value, problem.blocks.reasons
     used = np.array([not reason for reason in reasons])
-    weighted_with = point.scale
-    point.scale, point.repetition = _weighting(point)
-    noise = noise_scale(point.sums.histogram)
     state = point.state
     gauge = state.exposure.mean()
-    errors = standard_errors(problem, point)
+    steps = solution.history[-1]["step"] if solution.history else problem.settings.max_steps
+    passes = steps + 1 if solved.blocks is problem.blocks else 1 + WEIGHINGS
+    weighted_with = point.scale
+    point.scale, point.repetition = weighting(point)
+    errors = standard_errors(solved, point)
+    if solved.blocks is not problem.blocks:
+        for _ in range(WEIGHINGS):
+            weighted_with = point.scale
+            point = visit(problem, state, point.mean_log_albedo, weighted_with, 1.0)
+            point.scale, point.repetition = weighting(point)
     own = errors[: OWN * problem.images].reshape(-1, OWN)
+    noise = noise_scale(point.sums.histogram)
 
     def per_image(values):
         everyone = np.full(len(reasons), np.nan)
         everyone[used] = values
         return everyone
 
-    whole = WholeMaps(problem.blocks.grid.shape) if take is None else None
+    whole = WholeMaps(problem.blocks.shape) if take is None else None
     last_pass = LastPass(state, noise, problem.blocks.pixels, take or whole)
     visit(problem, state, point.mean_log_albedo, weighted_with, 1.0, last_pass)
     before, after = last_pass.disagreements()
@@ -271,7 +196,7 @@ def _result(problem, solution, passes, take):
         disagreement=after,
         noise=noise,
         repetition=point.repetition,
-        passes=passes,
+        passes=passes + 1,
         history=solution.history,
         outcome=solution.outcome,
         advice=solution.advice + _remarks(problem, groups),

@@ -31,6 +31,7 @@ from lommel.estimate.albedo_settings import AlbedoSettings
 # Prior standard errors of c1, c2, v2, v4. A strip under one Sun cannot tell phase from a trend of
 # albedo, so the lunar phase function is taken as known to a tenth; falloff is left loose.
 SHARED_ERROR = np.array([0.1, 0.05, 3.0, 3.0])
+LEAST_HAZE = 1e-3  # spread of haze, as a share of the level, that counts as none
 PIN = 1e-9  # of the diagonal, added where the gauge would make the matrix singular
 
 
@@ -218,13 +219,48 @@ def normal_equations(problem, point):
     return matrix, gradient
 
 
+class Factors:
+    """Normal matrix of the fitted unknowns in factors, hazes held to a mean of 0.
+
+    A haze that is the same share of all images cannot be told from contrast that the DEM's relief
+    lacks, so the mean of the hazes, in units of the images' levels, is a gauge.
+
+    Parameters
+    ----------
+    problem : Problem
+    matrix : sparse matrix (2 K + 5, 2 K + 5)
+        From `normal_equations`.
+    damping : float
+        Share of the diagonal added to it.
+
+    Attributes
+    ----------
+    fitted : int array (n,)
+        Indices of the fitted unknowns.
+    """
+
+    def __init__(self, problem, matrix, damping=0.0):
+        self.fitted = np.flatnonzero(problem.is_fitted)
+        matrix = matrix[self.fitted][:, self.fitted].tocsc()
+        matrix.setdiag(matrix.diagonal() * (1.0 + damping + PIN))
+        self.free = splu(matrix).solve
+        is_own = self.fitted < OWN * problem.images
+        self.hazes = (is_own & (self.fitted % OWN == 1)).astype(float)
+        self.along = self.free(self.hazes)
+
+    def solve(self, right):
+        """Solution for one or more right sides, array (n,) or (n, m)."""
+        answer = self.free(right)
+        if not self.hazes.any():
+            return answer
+        excess = (self.hazes @ answer) / (self.hazes @ self.along)
+        return answer - np.multiply.outer(self.along, excess)
+
+
 def standard_errors(problem, point):
     """Standard errors of all unknowns with the mean log exposure held; 0 where not fitted."""
-    matrix, _ = normal_equations(problem, point)
-    fitted = np.flatnonzero(problem.is_fitted)
-    matrix = matrix[fitted][:, fitted].tocsc()
-    matrix.setdiag(matrix.diagonal() * (1.0 + PIN))
-    factors = splu(matrix)
+    factors = Factors(problem, normal_equations(problem, point)[0])
+    fitted = factors.fitted
     # Projected onto mean log exposure 0: P C P^T with P = 1 - (mean over log exposures)
     is_exposure = (fitted < OWN * problem.images) & (fitted % OWN == 0)
     unit_mean = is_exposure / problem.images
@@ -240,6 +276,35 @@ def standard_errors(problem, point):
     errors = np.zeros(problem.is_fitted.size)
     errors[fitted] = np.sqrt(np.maximum(variance, 0.0))
     return errors
+
+
+def haze_spread(problem, point, most):
+    r"""Standard deviation of haze from image to image that the images themselves show.
+
+    One step towards the largest evidence (MacKay 1992, Neural Comput. 4, 415-447): with the hazes
+    :math:`h_k = b^k / \ell^k`, their standard errors :math:`e_k` and the spread :math:`\sigma_b`
+    that was expected,
+
+    .. math:: \sigma_b^2 \leftarrow \sum_k h_k^2 \big/ \sum_k (1 - e_k^2 / \sigma_b^2)
+
+    Parameters
+    ----------
+    problem : Problem
+    point : Point
+    most : float
+        The answer is this at most, and `LEAST_HAZE` at least.
+
+    Returns
+    -------
+    spread : float, share of an image's level
+    """
+    expected = problem.settings.haze_error
+    if not problem.settings.haze:
+        return expected
+    errors = standard_errors(problem, point)[1 : OWN * problem.images : OWN]
+    known = np.sum(1.0 - np.minimum(errors / expected, 1.0) ** 2)
+    square = np.sum((point.state.haze / point.state.level) ** 2)
+    return float(np.clip(np.sqrt(square / max(known, 1e-9)), min(LEAST_HAZE, most), most))
 
 
 def connected_groups(problem, point):

@@ -257,7 +257,7 @@ def accumulate(blocks, pairs, state, scale, loss, sums, keep=None):
 
     Parameters
     ----------
-    blocks : SampleBlocks
+    blocks : SampleBlocks or Cells
     pairs : Pairs
     state : State
         Image parameters and shared parameters.
@@ -276,7 +276,7 @@ def accumulate(blocks, pairs, state, scale, loss, sums, keep=None):
         first, last = blocks.span(block)
         if first < last:
             samples = blocks.block(block)
-            maps = empty_maps((last - first, blocks.grid.shape[1]))
+            maps = empty_maps((last - first, blocks.shape[1]))
             here = Sums(*(part[block] for part in sums))
             _visit_rows(first, last, samples, pairs, state, scale, loss, maps, here)
             if keep is not None:

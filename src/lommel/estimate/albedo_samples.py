@@ -129,6 +129,8 @@ class SampleBlocks:
 
     Attributes
     ----------
+    shape : tuple of int
+        Of the grid.
     windows : int64 array (used images, 4)
     levels, brightness : float64 array (used images,), image units
         Weighted mean of the used pixels, over that of the reflectance and as it is.
@@ -138,6 +140,7 @@ class SampleBlocks:
 
     def __init__(self, observations, grid, heights, model, masks, slope_noise, kept_pixels=None):
         self.grid, self.heights, self.model = grid, heights, model
+        self.shape = grid.shape
         self.masks, self.slope_noise = masks, slope_noise
         thin = [_thinned(image.measured) for image in observations]
         frames = [

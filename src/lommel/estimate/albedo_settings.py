@@ -34,10 +34,10 @@ class AlbedoSettings:
     albedo_contrast : float
         Expected standard deviation of the logarithm of mean albedo from image to image.
     haze_error : float
-        Expected standard deviation of haze, as a share of the image's level.
+        Largest standard deviation of haze from image to image, as a share of the image's level.
     masks : MaskSettings
     max_steps : int
-        Each is one pass over the images.
+        Of the default solver on cells of the images; of the alternating one each is a pass.
     tolerance : float
         The iteration ends when the cost falls by less than this share in one step.
     """
@@ -50,10 +50,10 @@ class AlbedoSettings:
     fit_phase_factor: bool = True
     fit_falloff: bool = True
     slope_noise: float | None = 0.5
-    albedo_contrast: float = 0.05
+    albedo_contrast: float = 0.075
     haze_error: float = 0.1
     masks: MaskSettings = field(default_factory=MaskSettings)
-    max_steps: int = 30
+    max_steps: int = 60
     tolerance: float = 1e-5
 
 

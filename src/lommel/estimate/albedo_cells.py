@@ -1,0 +1,122 @@
+r"""Images as means over cells of the ground, from which exposures, haze and the rest are read.
+
+A DEM is smoother than the ground, and an image has noise. Both blur the regression of one image on
+another, post by post, and a haze feigned by that runs along a chain of images as a drift of their
+exposures. Means over cells of many posts hold little of either, for the unknown slopes of a cell
+cancel but for a difference of height across it:
+
+.. math:: \bar I = T A \bar R f v + b
+
+with means over the used posts of a cell. Where images are some thousand posts wide a cell is some
+hundred times smaller than the ground it replaces, and the steps of the solver cost nothing beside
+the one pass that makes the cells. Most callers want `cells_of`.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numba import get_num_threads
+
+from lommel.estimate.albedo_arrays import BLOCKS, Samples
+
+ACROSS = 32  # cells along an image: enough to see a lens, few enough to leave relief behind
+FULLNESS = 8  # power of the used share of a cell in its weight: parts of it are other ground
+
+
+def cells_of(blocks):
+    """Cells of the images, or the samples themselves where images are small.
+
+    Parameters
+    ----------
+    blocks : SampleBlocks
+
+    Returns
+    -------
+    blocks : Cells or SampleBlocks
+    """
+    areas = blocks.windows[:, 2] * blocks.windows[:, 3]
+    size = int(np.sqrt(np.median(areas)) / ACROSS)
+    return Cells(blocks, size) if size > 1 else blocks
+
+
+class Cells:
+    """Means of samples over squares of posts, with the attributes and methods of `SampleBlocks`.
+
+    Parameters
+    ----------
+    blocks : SampleBlocks
+        Read once.
+    size : int, posts
+    """
+
+    def __init__(self, blocks, size):
+        self.levels, self.brightness = blocks.levels, blocks.brightness
+        self.shape = tuple(-(-posts // size) for posts in blocks.shape)
+        first = blocks.windows[:, :2] // size
+        last = -(-(blocks.windows[:, :2] + blocks.windows[:, 2:]) // size)
+        self.windows = np.concatenate([first, last - first], axis=1)
+        self.count = min(BLOCKS, self.shape[0])
+        sums = [np.zeros((7, *window[2:])) for window in self.windows]
+        with ThreadPoolExecutor(get_num_threads()) as threads:
+            parts = threads.map(lambda block: _sums(blocks, block, size), range(blocks.count))
+            for part in parts:  # in order, so that sums do not depend on the threads
+                for k, row, values in part:
+                    top = row - self.windows[k, 0]
+                    sums[k][:, top : top + values.shape[1]] += values
+        self.images = [_means(image, size**2) for image in sums]
+
+    def span(self, block):
+        """First row of a block, and the row behind its last one."""
+        return tuple(self.shape[0] * edge // self.count for edge in (block, block + 1))
+
+    def block(self, block):
+        """Samples of the rows of a block."""
+        first, last = self.span(block)
+        top = self.windows[:, 0]
+        low = np.clip(first, top, top + self.windows[:, 2])
+        high = np.clip(last, low, top + self.windows[:, 2])
+        sizes = (high - low) * self.windows[:, 3]
+        starts = np.cumsum(sizes) - sizes - (low - top) * self.windows[:, 3]
+        parts = [
+            image[:, a:b].reshape(len(image), -1)
+            for image, a, b in zip(self.images, low - top, high - top, strict=True)
+        ]
+        return Samples(self.windows, starts, *np.concatenate(parts, axis=1))
+
+
+def _sums(blocks, block, size):
+    """For each image in a block of rows: its number, first row of cells, sums over used posts."""
+    first, last = blocks.span(block)
+    if first == last:
+        return []
+    samples, found = blocks.block(block), []
+    for k, (row, col, rows, cols) in enumerate(samples.windows):
+        low, high = max(row, first), min(row + rows, last)
+        if low >= high:
+            continue
+        start = samples.starts[k] + (low - row) * cols
+        part = slice(start, start + (high - low) * cols)
+        used = (samples.weight[part] > 0).astype(np.float32)
+        variance = used / np.where(used > 0, samples.precision[part], 1.0)
+        given = (samples.measured, samples.reflectance, samples.phase, samples.off_axis)
+        planes = [used, samples.weight[part], variance, *(plane[part] * used for plane in given)]
+        values = np.stack(planes).reshape(len(planes), high - low, cols).astype(float)
+        values = np.add.reduceat(values, _edges(low, high, size), axis=1)
+        found.append((k, low // size, np.add.reduceat(values, _edges(col, col + cols, size), 2)))
+    return found
+
+
+def _edges(first, last, size):
+    """Where cells begin in the posts from first to before last."""
+    return np.maximum(np.arange(first // size, -(-last // size)) * size, first) - first
+
+
+def _means(sums, posts):
+    """Planes of `Samples` of one image, from its sums."""
+    used, weight, variance, *given = sums
+    safe = np.maximum(used, 1.0)
+    measured, reflectance, phase, off_axis = (plane / safe for plane in given)
+    weight = weight / safe * (used / posts) ** (1 + FULLNESS)
+    precision = np.divide(used, variance, out=np.zeros_like(used), where=used > 0)
+    planes = measured, reflectance, phase, off_axis, weight, precision
+    return np.stack(planes).astype(np.float32)
