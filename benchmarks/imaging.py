@@ -112,8 +112,10 @@ def _ground(heights, origin, spacing, radius, camera, direction, height):
 
 
 @njit(cache=True, parallel=True)
-def pinhole_image(heights, brightness, origin, spacing, radius, camera, axes, focal_length, out):
-    """What a pinhole camera sees; arguments as in `facet_brightness`.
+def pinhole_image(
+    heights, brightness, origin, spacing, radius, camera, axes, focal_length, out, first, size
+):
+    """What a pinhole camera sees in some lines; arguments as in `facet_brightness`.
 
     Parameters
     ----------
@@ -123,6 +125,8 @@ def pinhole_image(heights, brightness, origin, spacing, radius, camera, axes, fo
     focal_length : float, px
         The principal point is the middle of the image.
     out : float32 array (lines, samples)
+    first, size : int
+        Number of the first of these lines, and of all lines of the image.
     """
     lines, samples = out.shape
     for i in prange(lines):
@@ -131,7 +135,7 @@ def pinhole_image(heights, brightness, origin, spacing, radius, camera, axes, fo
         for j in range(samples):
             total = 0.0
             for ray in range(RAYS * RAYS):
-                y = np.int64(i) + (ray // RAYS + 0.5) / RAYS - 0.5 * lines
+                y = first + np.int64(i) + (ray // RAYS + 0.5) / RAYS - 0.5 * size
                 x = j + (ray % RAYS + 0.5) / RAYS - 0.5 * samples
                 length = np.sqrt(x * x + y * y + focal_length**2)
                 for k in range(3):

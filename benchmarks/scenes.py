@@ -93,14 +93,14 @@ def make_scene(scene, folder):
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(scene.seed)
-    heights = _relief(scene, rng)
+    heights = relief(scene, rng)
     first = (heights.shape[0] - FINENESS * scene.posts) // (2 * FINENESS)  # post of the DEM's edge
     inside = slice(first, first + scene.posts)
     posts = heights[::FINENESS, ::FINENESS]
-    _write_map(folder / "truth_dem.tif", posts[inside, inside], scene.spacing)
+    _write(folder / "truth_dem.tif", posts[inside, inside], scene.spacing)
     initial = blur(posts, scene.initial_blur)[inside, inside]
     initial += np.float32(scene.initial_noise) * rng.standard_normal(initial.shape, np.float32)
-    _write_map(folder / "init_dem.tif", initial, scene.spacing)
+    _write(folder / "init_dem.tif", initial, scene.spacing)
     albedo = np.ones((1, 1), np.float32)
     if scene.albedo_contrast > 0:
         albedo = _albedo(scene, rng, heights.shape)
@@ -110,14 +110,14 @@ def make_scene(scene, folder):
             for col in range(FINENESS)
         )
         within = slice(first, first + scene.posts - 1)
-        _write_map(folder / "truth_albedo.tif", cells[within, within] / FINENESS**2, scene.spacing)
+        _write(folder / "truth_albedo.tif", cells[within, within] / FINENESS**2, scene.spacing)
     # the DEM's posts are the centres of its pixels, and its middle is the map's origin
     half = 0.5 * scene.spacing * (scene.posts - 1) + first * scene.spacing
     ground = (np.array([-half, half]), scene.spacing / FINENESS, RADIUS)
     _take_images(scene, rng, heights, albedo, ground, folder)
 
 
-def _relief(scene, rng):
+def relief(scene, rng):
     """Heights of a periodic lattice of vertices, float32 array, m above the sphere."""
     size = FINENESS * fft.next_fast_len(scene.posts + 2 * MARGIN, real=True)
     heights = fractal(rng, (size, size), scene.hurst, FINENESS * scene.outer_scale / scene.spacing)
@@ -149,40 +149,39 @@ def _take_images(scene, rng, heights, albedo, ground, folder):
     image = np.empty((samples, samples), np.float32)
     suns = []
     for number in range(1, scene.images + 1):
-        sun = SUN_DISTANCE * _direction(*SUNS_DEG[number - 1])
-        camera, axes = _pinhole(*CAMERAS_DEG[number - 1])
+        sun = SUN_DISTANCE * direction(*SUNS_DEG[number - 1])
+        camera, axes = pinhole(*CAMERAS_DEG[number - 1])
         facet_brightness(heights, albedo, origin, spacing, radius, sun, camera, brightness)
-        pinhole_image(
-            heights, brightness, origin, spacing, radius, camera, axes, FOCAL_LENGTH, image
-        )
+        place = origin, spacing, radius, camera, axes, FOCAL_LENGTH
+        pinhole_image(heights, brightness, *place, image, 0, samples)
         image *= np.float32(scene.exposure)
         sigma = np.float32(scene.noise * image.mean(dtype=float))
         image += sigma * rng.standard_normal(image.shape, np.float32)
         _write(folder / f"img{number}.tif", image)
-        text = _tsai(_to_body(camera), _to_body(axes), samples)
+        text = tsai_text(to_body(camera), to_body(axes), samples)
         (folder / f"img{number}.tsai").write_text(text)
-        suns.append(f"img{number}.tif " + " ".join(f"{v:.6f}" for v in _to_body(sun)))
+        suns.append(f"img{number}.tif " + " ".join(f"{v:.6f}" for v in to_body(sun)))
     (folder / "sun_positions.txt").write_text("\n".join(suns) + "\n")
 
 
-def _direction(azimuth_deg, elevation_deg):
+def direction(azimuth_deg, elevation_deg):
     """Unit vector east, north, up."""
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
     flat = np.cos(elevation)
     return np.array([flat * np.sin(azimuth), flat * np.cos(azimuth), np.sin(elevation)])
 
 
-def _pinhole(azimuth_deg, off_nadir_deg):
+def pinhole(azimuth_deg, off_nadir_deg):
     """Place of a camera and its axes when it looks at the map's origin, samples to the east."""
     target = np.array([0.0, 0.0, RADIUS + DATUM])
-    back = _direction(azimuth_deg, 90.0 - off_nadir_deg)
+    back = direction(azimuth_deg, 90.0 - off_nadir_deg)
     camera = target + ALTITUDE / back[2] * back
     along_lines = np.cross(-back, [1.0, 0.0, 0.0])
     along_lines /= np.linalg.norm(along_lines)
     return camera, np.stack([np.cross(along_lines, -back), along_lines, -back])
 
 
-def _to_body(vectors):
+def to_body(vectors):
     """From the axes of the map's origin to body-fixed ones; vectors on the last axis."""
     sin_lon, cos_lon = np.sin(LONGITUDE), np.cos(LONGITUDE)
     sin_lat, cos_lat = np.sin(LATITUDE), np.cos(LATITUDE)
@@ -192,7 +191,7 @@ def _to_body(vectors):
     return vectors @ np.array([east, north, up])
 
 
-def _tsai(centre, axes, samples):
+def tsai_text(centre, axes, samples):
     """Text of a camera file; its pixels count from 0 at the centre of the first one."""
     pitch = 76.0 / FOCAL_LENGTH
     middle = pitch * (samples / 2 - 0.5)
@@ -214,20 +213,30 @@ def _tsai(centre, axes, samples):
     return "\n".join(rows) + "\n"
 
 
-def _write_map(path, values, spacing):
-    """A raster on the stereographic map whose middle is the origin."""
-    edge = 0.5 * spacing * values.shape[0]
+def map_profile(shape, spacing, dtype="float32"):
+    """What rasterio needs to write a raster on the stereographic map whose middle is the origin.
+
+    Parameters
+    ----------
+    shape : tuple of int
+    spacing : float, m, or None
+        None for an image as it was taken.
+    dtype : str
+    """
+    rows, cols = shape
+    profile = {"driver": "GTiff", "height": rows, "width": cols, "count": 1, "dtype": dtype}
+    if spacing is None:
+        return profile
     crs = (
         f"+proj=stere +lat_0={np.degrees(LATITUDE):.12g} +lon_0={np.degrees(LONGITUDE):.12g} "
         f"+k=1 +R={RADIUS:.12g} +units=m +no_defs"
     )
-    _write(path, values, crs=crs, transform=Affine(spacing, 0, -edge, 0, -spacing, edge))
+    top, left = 0.5 * spacing * rows, -0.5 * spacing * cols
+    return profile | {"crs": crs, "transform": Affine(spacing, 0, left, 0, -spacing, top)}
 
 
-def _write(path, values, **place):
-    rows, cols = values.shape
-    profile = {"driver": "GTiff", "height": rows, "width": cols, "count": 1, "dtype": "float32"}
+def _write(path, values, spacing=None):
     with warnings.catch_warnings():  # raw images have no place on a map
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.open(path, "w", **profile, **place) as file:
+        with rasterio.open(path, "w", **map_profile(values.shape, spacing)) as file:
             file.write(values, 1)
