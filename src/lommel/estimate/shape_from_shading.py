@@ -38,6 +38,7 @@ from lommel.estimate.albedo_field import (
     fit_albedo,
     observed_contrast,
 )
+from lommel.estimate.long_waves import Remainder, remainder, without_tilt
 from lommel.estimate.priors import Priors, PriorSettings, estimate_priors
 from lommel.estimate.problem import best_photometry, coarse_posts, exposure_gain, fresh_problem
 from lommel.estimate.shading_kernels import SUM_COUNT, SUM_RR
@@ -115,6 +116,8 @@ class SurfaceSolution:
         How well albedo and slope can be told apart, 0 to 1; see `separation`.
     priors : Priors
         As estimated or given.
+    left : Remainder or None
+        What a part leaves to the long waves of the whole scene.
     """
 
     u: np.ndarray
@@ -127,6 +130,7 @@ class SurfaceSolution:
     misfits: np.ndarray
     separation: np.ndarray
     priors: Priors
+    left: Remainder | None = None
 
 
 @dataclass(frozen=True)
@@ -144,12 +148,15 @@ class Start:
     misfits : array (images,), dimensionless
         Residuals that the whole scene leaves, in noise standard errors: they tell, for all its
         parts alike, whether there is something left for albedo.
+    own : tuple of slice
+        Posts that are this part's and no other's.
     """
 
     u: np.ndarray
     stride: int
     hold: np.ndarray
     misfits: np.ndarray
+    own: tuple[slice, slice]
 
 
 def solve_surface(
@@ -233,7 +240,10 @@ def solve_surface(
             u, converged = solve_jointly(finest, u, priors.albedo_contrast, settings, history)
     else:
         u, converged = _coarse_to_fine(finest, settings, history, start)
-    sums = finest.assemble(u)[2]
+    here = replace(finest, pins=None, pinned=None).expand(u)
+    sums, left_over = here.sums, None
+    if start is not None:
+        left_over = remainder(finest, here, u, start.own, start.stride.bit_length() - 1)
     misfits = np.sqrt(sums[:, SUM_RR] / np.maximum(sums[:, SUM_COUNT], 1))
     left = misfits if start is None else start.misfits
     if settings.estimate_albedo and not is_joint and left.max() > EXPLAINED:
@@ -250,6 +260,7 @@ def solve_surface(
         misfits,
         separation(finest, u),
         priors,
+        left_over,
     )
     names = [view.name for view in views]
     noise = np.median([n / np.nanmean(i) for n, i in zip(priors.noise, finest.cells, strict=True)])
@@ -386,27 +397,6 @@ def _is_small(step, u, level, settings):
 
 def _rms(change):
     return float(np.sqrt(dot(change, change) / change.size))
-
-
-def without_tilt(change):
-    """A change of the surface without its mean and its mean tilt.
-
-    An exposure and the tilt of the whole surface towards the Sun do the same to an image: what
-    tells them apart is the initial DEM, whose mean plane is kept.
-
-    Parameters
-    ----------
-    change : float32 array (rows, cols), m
-
-    Returns
-    -------
-    change : float32 array (rows, cols), m
-    """
-    row, col = (np.linspace(-1.0, 1.0, size) for size in change.shape)
-    by_row, by_col = change.mean(axis=1, dtype=float), change.mean(axis=0, dtype=float)
-    along_rows = by_row.mean() + (row @ by_row) / (row @ row) * row
-    along_cols = (col @ by_col) / (col @ col) * col
-    return change - along_rows.astype(np.float32)[:, None] - along_cols.astype(np.float32)[None, :]
 
 
 def _best_cost(here, level, settings):

@@ -318,15 +318,18 @@ def free_memory():
     return min(sizes)
 
 
-def blend_weights(tile, window, shape):
-    """Share of a tile at the posts of a window; the shares of all tiles sum to 1.
+def blend_weights(tile, window, shape, stride=1):
+    """Share of a tile at posts of the scene; the shares of all tiles sum to 1.
 
     Parameters
     ----------
     tile : Tile
     window : Window
+        Where the first of these posts is, and how many there are.
     shape : tuple of int
         Of the scene.
+    stride : int
+        From one of these posts to the next.
 
     Returns
     -------
@@ -336,7 +339,7 @@ def blend_weights(tile, window, shape):
     ends = (tile.inner.row, tile.inner.rows), (tile.inner.col, tile.inner.cols)
     places = (window.row, window.rows), (window.col, window.cols)
     for (first, size), (begin, count), whole in zip(ends, places, shape, strict=True):
-        post = begin + np.arange(count)
+        post = begin + stride * np.arange(count)
         is_last = first + size >= whole
         share = np.ones(count) if first == 0 else _rise(post - first)
         along.append(share if is_last else share - _rise(post - first - size))

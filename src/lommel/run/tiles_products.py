@@ -14,7 +14,8 @@ from lommel.run.inputs import Skipped
 from lommel.run.shape_from_shading import cell_grid, write_exposures
 from lommel.run.tiles_plan import blend_weights
 from lommel.run.tiles_records import part_folder, read_array, read_record
-from lommel.run.tiles_solve import stored_window
+from lommel.run.tiles_settle import settle_tiles
+from lommel.run.tiles_solve import at_posts, stored_window
 
 PRODUCTS = {  # description and unit, as of a scene in one piece
     "dem": ("height", "m"),
@@ -60,7 +61,8 @@ def finish_products(run, work, folder, record, known):
     scene = read_record(work / "scene")
     tiles = [read_record(part_folder(work, tile.number)) for tile in run.plan.tiles]
     record.add_skipped([Skipped(**skip) for skip in scene["skipped"]])
-    sums = _write_products(folder, run.grid, run.plan, work)
+    correction = settle_tiles(run, work, known.correction.shape)
+    sums = _write_products(folder, run.grid, run.plan, work, correction)
     fit = SimpleNamespace(
         exposures=known.exposures, hazes=known.hazes, misfits=_misfits(known.names, tiles)
     )
@@ -74,7 +76,7 @@ def finish_products(run, work, folder, record, known):
     ]
 
 
-def _write_products(folder, grid, plan, work):
+def _write_products(folder, grid, plan, work, correction):
     """Blend the tiles into rasters, window by window; sums for the results."""
     cells, sums = cell_grid(grid), {}
     for name, texts in PRODUCTS.items():
@@ -85,6 +87,8 @@ def _write_products(folder, grid, plan, work):
                 if window.is_empty:
                     continue
                 values = _blended(name, window, plan, work)
+                if name == "dem":
+                    values += at_posts(correction, plan.stride, window)
                 write(values, window)
                 if name == "dem":
                     values = values - _blended("initial-dem", window, plan, work)

@@ -276,8 +276,8 @@ def solve_tile(files, grid, tile, known, settings):
 
     Returns
     -------
-    products : dict of str to float32 array
-        On the posts or cells of `stored_window`.
+    products : dict of str to array
+        On the posts or cells of `stored_window`, and the parts of a `Remainder`.
     record : dict
         Outcome, images, what was left out and why.
     """
@@ -300,7 +300,7 @@ def solve_tile(files, grid, tile, known, settings):
     initial = fill_holes(scene.heights)
     surface = known.surface(part, settings.parametrisation)
     u = surface.posts_from_heights(initial)
-    start = u + _correction(known, tile.outer)
+    start = u + at_posts(known.correction, known.stride, tile.outer)
     albedo, _ = read_known(settings.albedo, None, cell_grid(part), names)
     solution = solve_surface(
         surface,
@@ -311,7 +311,13 @@ def solve_tile(files, grid, tile, known, settings):
         settings.solver,
         albedo,
         (known.exposures[seen_by], known.hazes[seen_by]),
-        start=Start(start, known.stride, _hold(tile, grid, known.priors), known.misfits[seen_by]),
+        start=Start(
+            start,
+            known.stride,
+            _hold(tile, grid, known.priors),
+            known.misfits[seen_by],
+            tile.inner.relative_to(tile.outer).slices,
+        ),
     )
     value = solution.value
     refined = surface.heights_from_posts(value.u)
@@ -329,6 +335,7 @@ def solve_tile(files, grid, tile, known, settings):
         "residual": _residual(value, known.brightness[seen_by]),
     }
     products |= {name: values[inside] for name, values in cells.items()}
+    products |= {f"left-{name}": values for name, values in vars(value.left).items()}
     pairs = zip(value.measured, value.modelled, strict=True)
     counts = [int(np.isfinite(image[inside]).sum()) for image in value.measured]
     record = {
@@ -377,15 +384,26 @@ def _residual(value, brightness):
     return np.sqrt(total / np.where(count > 0, count, np.nan).astype(np.float32))
 
 
-def _correction(known, window):
-    """The coarse correction at the posts of a window, by a cubic spline, m."""
+def at_posts(coarse, stride, window):
+    """A field on coarse posts at the posts of a window, by a cubic spline.
+
+    Parameters
+    ----------
+    coarse : float32 array (coarse rows, coarse cols)
+    stride : int
+    window : Window
+
+    Returns
+    -------
+    values : float32 array (rows, cols)
+    """
     from scipy.ndimage import map_coordinates  # slow to import
 
-    row = (window.row + np.arange(window.rows)) / known.stride
-    col = (window.col + np.arange(window.cols)) / known.stride
+    row = (window.row + np.arange(window.rows)) / stride
+    col = (window.col + np.arange(window.cols)) / stride
     # what the spline of a window needs of its surroundings
     low_row, low_col = max(int(row[0]) - 12, 0), max(int(col[0]) - 12, 0)
-    near = known.correction[low_row : int(row[-1]) + 14, low_col : int(col[-1]) + 14]
+    near = coarse[low_row : int(row[-1]) + 14, low_col : int(col[-1]) + 14]
     places = np.meshgrid(row - low_row, col - low_col, indexing="ij")
     return map_coordinates(near, places, order=3, mode="nearest").astype(np.float32)
 
