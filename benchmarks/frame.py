@@ -189,6 +189,18 @@ def errors(folder, output):
     return np.sqrt(totals[:2] / totals[2])
 
 
+def ensure_frame(folder, posts):
+    """Make the frame unless the folder holds it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if (folder / f"{posts}.made").exists():
+        return
+    start = time.perf_counter()
+    make_frame(Scene(posts, 1, seed=2), folder)
+    (folder / f"{posts}.made").touch()
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    print(f"made in {time.perf_counter() - start:.0f} s, {most:.1f} GB", flush=True)
+
+
 def main():
     """Make, refine, compare; the folder stays for a look and is removed by hand."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -197,13 +209,7 @@ def main():
     parser.add_argument("options", nargs="*", help="of lommel sfs, after --")
     given = parser.parse_args()
     folder, output = given.folder, given.folder / "refined"
-    folder.mkdir(parents=True, exist_ok=True)
-    if not (folder / f"{given.posts}.made").exists():
-        start = time.perf_counter()
-        make_frame(Scene(given.posts, 1, seed=2), folder)
-        (folder / f"{given.posts}.made").touch()
-        most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-        print(f"made in {time.perf_counter() - start:.0f} s, {most:.1f} GB", flush=True)
+    ensure_frame(folder, given.posts)
     command = [str(Path(sys.executable).parent / "lommel"), "sfs", str(folder / "img1.tif")]
     command += ["--dem", str(folder / "init_dem.tif"), "--output", str(output), "--overwrite"]
     command += ["--sun-positions", str(folder / "sun_positions.txt"), *given.options]

@@ -55,6 +55,7 @@ def test_a_plan_stays_within_memory(memory):
     plan = make_plan((20_000, 20_000), 3, memory)
     assert plan.is_tiled
     assert plan.memory <= memory
+    assert plan.side < 20_000 / len(plan.tiles) ** 0.5 + STEP  # all of them about as large
     assert plan.shape[0] * plan.shape[1] / plan.stride**2 * 250 < memory
     assert not make_plan((500, 500), 3, memory).is_tiled
 

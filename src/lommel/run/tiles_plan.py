@@ -178,7 +178,7 @@ def make_plan(shape, images, memory, side=None, stride=None):
         whole = Window(0, 0, rows, cols)
         return Plan(shape, images, 1, (Tile(0, whole, whole),), AT_REST + rows * cols * per_post)
     if side is None:
-        side = int(max(posts, 0) ** 0.5 - 2 * HALO) // STEP * STEP
+        side = _even_side(shape, int(max(posts, 0) ** 0.5 - 2 * HALO) // STEP * STEP)
     if side < min(LEAST_SIDE, STEP):
         least = AT_REST + per_post * (LEAST_SIDE + 2 * HALO) ** 2
         raise InputError(
@@ -247,6 +247,15 @@ def cores():
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not every system tells
         return os.cpu_count() or 1
+
+
+def _even_side(shape, most):
+    """The least side that cuts the scene into no more tiles than the largest one does."""
+    if most <= 0:
+        return most
+    counts = [-(-size // most) for size in shape]
+    least = max(-(-size // count) for size, count in zip(shape, counts, strict=True))
+    return -(-least // STEP) * STEP
 
 
 def _cuts(size, side):
