@@ -1,7 +1,7 @@
-"""Values between the pixels of an image, one place at a time, for compiled loops."""
+"""Values between the pixels of an image, one place at a time, and between coarse posts."""
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 
 FAST = {"contract", "nsz"}
 
@@ -66,3 +66,44 @@ def sample_cubic(image, line, sample):
         if not np.isnan(value):
             return value
     return sample_linear(image, line, sample)
+
+
+@njit(cache=True, parallel=True, error_model="numpy", fastmath=FAST)
+def refine_spline(coefficients, stride, first_row, first_col, out):
+    """A cubic spline on coarse posts, at the posts between them.
+
+    Parameters
+    ----------
+    coefficients : float32 array (coarse rows, coarse cols)
+        Of B-splines that are mirrored at the ends, as of `scipy.ndimage.spline_filter`.
+    stride : int
+        Posts per coarse post.
+    first_row, first_col : int
+        Post (0, 0) of the result, counted from the first coarse post.
+    out : float32 array (rows, cols)
+    """
+    weights = np.empty((stride, 4), np.float32)
+    for phase in range(stride):
+        t = phase / stride
+        s = 1.0 - t
+        weights[phase, 0] = s * s * s / 6
+        weights[phase, 1] = (4 - 6 * t * t + 3 * t * t * t) / 6
+        weights[phase, 2] = (4 - 6 * s * s + 3 * s * s * s) / 6
+        weights[phase, 3] = t * t * t / 6
+    rows, cols = coefficients.shape
+    for i in prange(out.shape[0]):
+        post = first_row + np.int64(i)
+        w, r = weights[post % stride], post // stride
+        above, here = coefficients[abs(r - 1)], coefficients[r]
+        below = coefficients[rows - 1 - abs(rows - 2 - r)]
+        beyond = coefficients[rows - 1 - abs(rows - 3 - r)]
+        line = np.empty(cols + 3, np.float32)
+        for c in range(cols):
+            line[c + 1] = w[0] * above[c] + w[1] * here[c] + w[2] * below[c] + w[3] * beyond[c]
+        line[0], line[cols + 1], line[cols + 2] = line[2], line[cols - 1], line[cols - 2]
+        for j in range(out.shape[1]):
+            c, phase = (first_col + j) // stride, (first_col + j) % stride
+            v = weights[phase]
+            out[i, j] = (
+                v[0] * line[c] + v[1] * line[c + 1] + v[2] * line[c + 2] + v[3] * line[c + 3]
+            )

@@ -4,6 +4,7 @@ Most callers want `finish_products`.
 """
 
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from types import SimpleNamespace
 
@@ -28,6 +29,8 @@ PRODUCTS = {  # description and unit, as of a scene in one piece
     "hillshade-before": ("cosine of incidence", "1"),
     "hillshade-after": ("cosine of incidence", "1"),
 }
+AT_ONCE = 2  # products: compressing one, and shrinking it for overviews, keeps a core busy
+MEASURED = ("dem", "residual")  # their root mean squares are results
 ON_POSTS = ("dem", "initial-dem")  # the others live on the cells between posts
 
 
@@ -77,26 +80,35 @@ def finish_products(run, work, folder, record, known):
 
 
 def _write_products(folder, grid, plan, work, correction):
-    """Blend the tiles into rasters, window by window; sums for the results."""
-    cells, sums = cell_grid(grid), {}
-    for name, texts in PRODUCTS.items():
-        frame = grid if name in ON_POSTS else cells
-        with raster_writer(folder / f"{name}.tif", frame, *texts) as write:
-            for tile in plan.tiles:
-                window = tile.inner.intersection(frame.window)
-                if window.is_empty:
-                    continue
-                values = _blended(name, window, plan, work)
-                if name == "dem":
-                    values += at_posts(correction, plan.stride, window)
-                write(values, window)
-                if name == "dem":
-                    values = values - _blended("initial-dem", window, plan, work)
-                if name in ("dem", "residual"):
-                    count, total = sums.get(name, (0, 0.0))
-                    total += float(np.nansum(values.astype(float) ** 2))
-                    sums[name] = count + int(np.isfinite(values).sum()), total
-    return {name: (total / max(count, 1)) ** 0.5 for name, (count, total) in sums.items()}
+    """Blend the tiles into rasters, several at a time; root mean squares for the results."""
+
+    def write(name):
+        return _write_product(name, folder, grid, plan, work, correction)
+
+    with ThreadPoolExecutor(AT_ONCE) as threads:
+        return dict(zip(PRODUCTS, threads.map(write, PRODUCTS), strict=True))
+
+
+def _write_product(name, folder, grid, plan, work, correction):
+    """Blend one product window by window; its root mean square where that is asked for."""
+    frame, count, total = grid if name in ON_POSTS else cell_grid(grid), 0, 0.0
+    with raster_writer(folder / f"{name}.tif", frame, *PRODUCTS[name]) as write:
+        for tile in plan.tiles:
+            window = tile.inner.intersection(frame.window)
+            if window.is_empty:
+                continue
+            values = _blended(name, window, plan, work)
+            if name == "dem":  # the only one that calls compiled loops: two threads must not
+                values += at_posts(correction, plan.stride, window)
+            write(values, window)
+            if name == "dem":
+                values -= _blended("initial-dem", window, plan, work)
+            if name not in MEASURED:
+                continue
+            known = np.isfinite(values)
+            total += float(np.sum(values[known].astype(float) ** 2))
+            count += int(known.sum())
+    return (total / max(count, 1)) ** 0.5
 
 
 def _blended(name, window, plan, work):

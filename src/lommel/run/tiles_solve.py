@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+from lommel.core.interpolation import refine_spline
 from lommel.core.multigrid import coarse_masses
 from lommel.core.reflectance import reflectance_model
 from lommel.errors import InputError, LommelError, UnreadableError
@@ -25,6 +26,7 @@ from lommel.run.tiles_plan import BLEND, coarse_grid
 from lommel.run.views import read_views
 from lommel.scene.grid import Window
 
+REACH = 12  # coarse posts beyond which a spline's coefficients feel less than 1e-6 of a value
 SAMPLE = 513  # posts along each side of the windows that tell priors and photometry
 SAMPLES = 3  # of them along each side of a larger scene
 # The coarse surface errs by what area means and a coarse grid leave. Held more firmly the rim
@@ -397,15 +399,17 @@ def at_posts(coarse, stride, window):
     -------
     values : float32 array (rows, cols)
     """
-    from scipy.ndimage import map_coordinates  # slow to import
+    from scipy.ndimage import spline_filter  # slow to import
 
-    row = (window.row + np.arange(window.rows)) / stride
-    col = (window.col + np.arange(window.cols)) / stride
     # what the spline of a window needs of its surroundings
-    low_row, low_col = max(int(row[0]) - 12, 0), max(int(col[0]) - 12, 0)
-    near = coarse[low_row : int(row[-1]) + 14, low_col : int(col[-1]) + 14]
-    places = np.meshgrid(row - low_row, col - low_col, indexing="ij")
-    return map_coordinates(near, places, order=3, mode="nearest").astype(np.float32)
+    low_row, low_col = (max(first // stride - REACH, 0) for first in (window.row, window.col))
+    last_row, last_col = (window.row + window.rows) // stride, (window.col + window.cols) // stride
+    near = coarse[low_row : last_row + REACH, low_col : last_col + REACH]
+    coefficients = spline_filter(near, 3, np.float32, "mirror")
+    values = np.empty(window.shape, np.float32)
+    first = window.row - stride * low_row, window.col - stride * low_col
+    refine_spline(coefficients, stride, *first, values)
+    return values
 
 
 def _hold(tile, grid, priors):
