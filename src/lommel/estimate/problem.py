@@ -89,8 +89,17 @@ class Problem:
     pins: np.ndarray | None = None
     pinned: np.ndarray | None = None
     shadows: list = field(default_factory=list)
+    outside: np.ndarray | None = None
+    brightness: np.ndarray | None = None
     geometry: list = field(default_factory=list)
     memory: dict = field(default_factory=dict)
+
+    def see(self, u):
+        """Everything that follows from where the surface ``u`` is: geometry, images, shadows."""
+        self.prepare_geometry(u)
+        self.shadows = []  # of another surface
+        self.sample_images(u)
+        self.find_shadows(u)
 
     def prepare_geometry(self, u):
         """Compute the lattice planes for the surface ``u``."""
@@ -293,16 +302,19 @@ class Problem:
     def find_shadows(self, u):
         """Blank the cells that terrain shadows, where the images are dark there as well."""
         lattice, at_nodes, frame, _, _ = self.geometry
-        self.shadows = []
-        for view, cells in zip(self.views, self.cells, strict=True):
+        for k, (view, cells) in enumerate(zip(self.views, self.cells, strict=True)):
             to_sun = unit(view.sun_position - frame.xyz)
             sine = np.einsum("...i,...i", to_sun, frame.up)
             lateral = to_sun / np.maximum(sine, LOWEST_SUN)[..., None] - frame.up
             rays = self.surface.posts_crossed(lattice, at_nodes, lateral).astype(np.float32)
             shadow = np.empty(cells.shape, np.bool_)
-            darkest = np.float32(DARK * np.nanmedian(cells[::4, ::4]))
+            known = self.brightness
+            middle = np.nanmedian(cells[::4, ::4]) if known is None else known[k]
+            darkest = np.float32(DARK * middle)
             with threads_for(u.shape):
                 cast_shadow(u, rays, lattice.step, u.max(), cells, darkest, shadow)
+            if self.outside is not None:
+                shadow |= self.outside[k] & (cells <= darkest)
             self.shadows.append(widened(shadow))
             cells[self.shadows[-1]] = np.nan
 
@@ -327,6 +339,7 @@ class Problem:
             exposures=self.exposures.copy(),
             stride=2 * self.stride,
             shadows=[],
+            outside=None,
             memory={},
             initial=coarse_posts(self.initial),
             expected=coarse_posts(self.expected),

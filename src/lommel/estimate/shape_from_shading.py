@@ -116,6 +116,8 @@ class SurfaceSolution:
         How well albedo and slope can be told apart, 0 to 1; see `separation`.
     priors : Priors
         As estimated or given.
+    shadows : list of bool array (rows - 1, cols - 1)
+        Cells of each image that terrain shadows.
     left : Remainder or None
         What a part leaves to the long waves of the whole scene.
     """
@@ -130,6 +132,7 @@ class SurfaceSolution:
     misfits: np.ndarray
     separation: np.ndarray
     priors: Priors
+    shadows: list
     left: Remainder | None = None
 
 
@@ -150,6 +153,10 @@ class Start:
         parts alike, whether there is something left for albedo.
     own : tuple of slice
         Posts that are this part's and no other's.
+    shadows : bool array (images, rows - 1, cols - 1)
+        Where the terrain of the whole scene casts shadow, also from outside.
+    brightness : array (images,), image units
+        Medians over the whole scene: a part may lie in shadow for the most.
     """
 
     u: np.ndarray
@@ -157,6 +164,8 @@ class Start:
     hold: np.ndarray
     misfits: np.ndarray
     own: tuple[slice, slice]
+    shadows: np.ndarray
+    brightness: np.ndarray
 
 
 def solve_surface(
@@ -202,9 +211,9 @@ def solve_surface(
     if photometry is not None:
         settings = replace(settings, estimate_exposure=False, estimate_haze=False)
     finest = fresh_problem(surface, initial, views, model, albedo)
-    finest.prepare_geometry(finest.initial)
-    finest.sample_images(finest.initial)
-    finest.find_shadows(finest.initial)
+    if start is not None:
+        finest.outside, finest.brightness = start.shadows, start.brightness
+    finest.see(finest.initial)
     if photometry is None:
         # a blurred DEM explains part of the contrast only: haze would seem to explain the rest
         first_sums = finest.assemble(finest.initial)[2]
@@ -234,9 +243,7 @@ def solve_surface(
     if is_joint:
         u, converged = finest.initial, False
         for _ in range(2):  # shadows of the smooth start are not those of the relief found
-            finest.prepare_geometry(u)
-            finest.sample_images(u)
-            finest.find_shadows(u)
+            finest.see(u)
             u, converged = solve_jointly(finest, u, priors.albedo_contrast, settings, history)
     else:
         u, converged = _coarse_to_fine(finest, settings, history, start)
@@ -260,6 +267,7 @@ def solve_surface(
         misfits,
         separation(finest, u),
         priors,
+        finest.shadows,
         left_over,
     )
     names = [view.name for view in views]
@@ -324,9 +332,7 @@ def _coarse_to_fine(finest, settings, history, start=None):
             u = level.initial + correction
             level.exposures, level.hazes = coarse.exposures, coarse.hazes
         if level is finest:
-            level.prepare_geometry(u)
-            level.sample_images(u)
-            level.find_shadows(u)
+            level.see(u)
         steps = settings.max_steps if level is finest else min(COARSE_STEPS, level.stride)
         if level.pins is not None:  # the start is smooth: all relief is still to be found
             steps = settings.max_steps

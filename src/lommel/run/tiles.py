@@ -46,6 +46,7 @@ ARRAYS = [
     "misfits",
     "thresholds",
     "correction",
+    "shadows",
     "position",
     "sun_position",
 ]

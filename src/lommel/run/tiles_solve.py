@@ -52,6 +52,8 @@ class Known:
     stride : int
     correction : float32 array (coarse rows, coarse cols), m
         Change of the unknowns that the coarse solution found.
+    shadows : bool array (images, coarse rows - 1, coarse cols - 1)
+        Coarse cells that terrain shadows.
     base_height : float, m
     position, sun_position : array (3,), m
         Of the first image.
@@ -67,6 +69,7 @@ class Known:
     priors: Priors
     stride: int
     correction: np.ndarray
+    shadows: np.ndarray
     base_height: float
     position: np.ndarray
     sun_position: np.ndarray
@@ -136,6 +139,7 @@ def prepare_scene(files, grid, stride, settings, progress=iter):
         replace(priors, noise=noise),
         stride,
         value.u - start,
+        np.stack(value.shadows),
         base,
         np.asarray(first.position, float),
         np.asarray(first.sun_position, float),
@@ -319,6 +323,8 @@ def solve_tile(files, grid, tile, known, settings):
             _hold(tile, grid, known.priors),
             known.misfits[seen_by],
             tile.inner.relative_to(tile.outer).slices,
+            _shadows(known, seen_by, tile.outer),
+            known.brightness[seen_by],
         ),
     )
     value = solution.value
@@ -410,6 +416,18 @@ def at_posts(coarse, stride, window):
     first = window.row - stride * low_row, window.col - stride * low_col
     refine_spline(coefficients, stride, *first, values)
     return values
+
+
+def _shadows(known, seen_by, window):
+    """Shadows of the coarse surface on the cells of a window, bool array (images, rows, cols)."""
+    stride, first = known.stride, (window.row // known.stride, window.col // known.stride)
+    cells = [size - 1 for size in window.shape]
+    count = [-(-size // stride) for size in cells]
+    out = np.empty((len(seen_by), *cells), bool)
+    for k, image in enumerate(seen_by):
+        part = known.shadows[image, first[0] : first[0] + count[0], first[1] : first[1] + count[1]]
+        out[k] = part.repeat(stride, 0).repeat(stride, 1)[: cells[0], : cells[1]]
+    return out
 
 
 def _hold(tile, grid, priors):
