@@ -334,7 +334,7 @@ def _coarse_to_fine(finest, settings, history, start=None):
         if level is finest:
             level.see(u)
         steps = settings.max_steps if level is finest else min(COARSE_STEPS, level.stride)
-        if level.pins is not None:  # the start is smooth: all relief is still to be found
+        if level.pins is not None and start is None:  # smooth: all relief is still to be found
             steps = settings.max_steps
         u, converged = _descend(level, u, steps, settings, history)
     return u, converged
