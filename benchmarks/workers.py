@@ -26,7 +26,7 @@ def refine(folder, memory, workers):
     command = [str(Path(sys.executable).parent / "lommel"), "sfs", str(folder / "img1.tif")]
     command += ["--dem", str(folder / "init_dem.tif"), "--output", str(output), "--overwrite"]
     command += ["--sun-positions", str(folder / "sun_positions.txt"), "--memory", memory]
-    with LocalCluster(workers, threads_per_worker=1, dashboard_address=None) as cluster:
+    with LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster:
         start = time.perf_counter()
         scheduler = ["--engine", "dask", "--dask-scheduler", cluster.scheduler_address]
         subprocess.run([*command, *scheduler], check=True, stdout=subprocess.DEVNULL)
