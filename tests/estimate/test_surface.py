@@ -76,3 +76,16 @@ def test_ray_points_lie_on_the_terrain():
     longitude, latitude, height = to_lonlat(MOON, base + u[..., None] * direction)
     there = map_coordinates(heights, np.stack(grid.index_at(longitude, latitude)), order=3)
     np.testing.assert_allclose(there[4:-4, 4:-4], height[4:-4, 4:-4], atol=HEIGHT)
+
+
+def test_a_scarp_steeper_than_the_view_does_no_harm():
+    """Where rays meet the terrain more than once, heights still stay between foot and plateau."""
+    grid = patch_grid()
+    _, camera = positions(100.0, view_elevation_deg=40.0)
+    surface = Surface(grid, 0.0, camera)
+    col = np.arange(grid.shape[1], dtype=np.float32)
+    height, foot = 300.0, 20  # m, columns; the plateau lies in the east, where the camera is
+    profile = height * np.clip((col - foot) / 5, 0, 1)  # 72 degrees
+    heights = np.ascontiguousarray(np.broadcast_to(profile, grid.shape))
+    again = surface.heights_from_posts(surface.posts_from_heights(heights))[12:-20]
+    assert again.min() > -40 and again.max() < height + 40  # m, the splines' overshoot at edges

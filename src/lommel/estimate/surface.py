@@ -36,6 +36,8 @@ LATTICE_ANGLE = 0.006
 # Fixed-point steps from rays back to posts: each leaves the share tan(slope) tan(e) of the error,
 # little where one looks down, most of it where one looks along slopes from aside.
 RAY_STEPS, RAY_ERROR = 12, 1e-3  # at most; m, the change that ends them
+# Posts that they do not settle see ground that hides other ground: there the ray is walked down,
+RAY_STRIDE, HALVINGS = 0.5, 16  # posts at a time, and halved so often
 
 
 @dataclass(frozen=True)
@@ -194,19 +196,17 @@ class Surface:
         drift = np.stack([map_coordinates(d, places / lattice.step, order=1) for d in drift])
         values = np.asarray(field, np.float32)
         coefficients = spline_filter(field, 3, np.float32, "nearest")
+        drift *= np.float32(sign)
+
+        def at(places):
+            return map_coordinates(coefficients, places, order=3, mode="nearest", prefilter=False)
+
         for _ in range(RAY_STEPS):
-            last, values = (
-                values,
-                map_coordinates(
-                    coefficients,
-                    places + np.float32(sign) * drift * values,
-                    order=3,
-                    mode="nearest",
-                    prefilter=False,
-                ),
-            )
-            if np.abs(values - last).max() < RAY_ERROR:
-                break
+            last, values = values, at(places + drift * values)
+            is_open = np.abs(values - last) > RAY_ERROR
+            if not is_open.any():
+                return values
+        values[is_open] = _highest(at, places[:, is_open], drift[:, is_open], field)
         return values
 
     def _tangents(self, lattice, u):
@@ -231,6 +231,37 @@ class Surface:
             return base, up, up
         ray = unit(self.camera_position - base)
         return base, ray / _inner(ray, up)[..., None], up
+
+
+def _highest(at, places, drift, field):
+    """The highest ``v`` with ``v = at(places + drift v)``: of ground that hides other, the seen.
+
+    Parameters
+    ----------
+    at : function (array (2, points)) -> array (points,), m
+    places : array (2, points), posts
+    drift : array (2, points), posts per m
+    field : float32 array (rows, cols), m
+        Whose values ``at`` interpolates.
+
+    Returns
+    -------
+    values : array (points,), m
+    """
+    above = np.full(places.shape[1], field.max())
+    step = np.float32(RAY_STRIDE) / np.linalg.norm(drift, axis=0)
+    waits = np.ones(above.size, bool)
+    while waits.any():  # down to the first place that lies under the surface
+        below = np.maximum(above[waits] - step[waits], field.min())
+        is_under = at(places[:, waits] + drift[:, waits] * below) >= below
+        above[waits] = np.where(is_under, above[waits], below)
+        waits[waits] = ~is_under & (below > field.min())
+    below = np.maximum(above - step, field.min())
+    for _ in range(HALVINGS):
+        middle = (above + below) / 2
+        is_under = at(places + drift * middle) >= middle
+        below, above = np.where(is_under, middle, below), np.where(is_under, above, middle)
+    return (above + below) / 2
 
 
 def _inner(a, b):
