@@ -11,7 +11,7 @@ from lommel.estimate.problem import fresh_problem
 from lommel.estimate.sampling_kernels import sample_cells
 from lommel.estimate.shading_kernels import SUM_COUNT, SUM_FF, SUM_FM
 from lommel.estimate.surface import Surface
-from lommel.scene.geometry import surface_normals, viewing_geometry
+from lommel.scene.geometry import surface_normals, unit, viewing_geometry
 from lommel.scene.grid import Grid
 from lommel.scene.shadows import sunlit
 
@@ -167,3 +167,20 @@ def test_cast_shadow_agrees_with_ray_marching_on_the_sphere():
     assert shadow[~lit].mean() > 0.97  # all of it, but for rims thinner than a post
     grown = binary_dilation(~lit, iterations=3)
     assert shadow[~grown].mean() < 0.01
+
+
+def test_points_that_rise_along_the_view_take_the_slope_of_the_ground_along():
+    """On a plane the surface through points moved along their rays is known in closed form."""
+    grid = patch_grid()
+    row, col = np.indices(grid.shape).astype(np.float32)
+    u = 3 * row - 2 * col  # m; 9 and 6 degrees
+    problem = exact_problem(u, grid)
+    lattice, at_nodes, frame, _, _ = problem.geometry
+    to_camera = unit(problem.views[0].position - frame.xyz)
+    rise = np.einsum("...i,...i", to_camera, frame.up)[..., None]
+    crossed = problem.surface.posts_crossed(lattice, at_nodes, to_camera / rise - frame.up)
+    drift = crossed.mean(axis=(1, 2))  # posts per m: 20 degrees from the vertical, 20 m posts
+    assert np.hypot(*drift) == pytest.approx(np.tan(np.radians(20)) / 20, rel=0.02)
+    step = np.full(grid.shape, 0.5, np.float32)
+    problem.slide_along_views(step, u)
+    np.testing.assert_allclose(step, 0.5 * (1 - 3 * drift[0] + 2 * drift[1]), rtol=2e-3)

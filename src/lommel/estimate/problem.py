@@ -18,7 +18,7 @@ from lommel.core.normal_operator import (
     slope_adjoint,
 )
 from lommel.core.reflectance import reflectance_model
-from lommel.estimate.sampling_kernels import cast_shadow, sample_cells
+from lommel.estimate.sampling_kernels import cast_shadow, sample_cells, slide_along
 from lommel.estimate.shading_kernels import (
     SUM_COST,
     SUM_F,
@@ -36,6 +36,7 @@ from lommel.scene.masks import widened
 SLOPE_STEP = 0.01  # for the change of brightness with slope: R bends little over half a degree
 HAZE_ERROR = 0.1  # of the mean brightness: scattered light and film base are not more
 LOWEST_SUN = 0.01  # sine of the elevation below which shadows are not followed any longer
+LOWEST_VIEW = 0.1  # sine of the elevation below which a view is taken for no lower
 DARK = 0.5  # of the median brightness: the image itself denies a shadow that is brighter
 NOT_COUPLED = np.empty((4, 0, 0), np.float32)
 HUBER_SCALE = 3.0  # noise standard errors from which a residual counts as an outlier
@@ -287,6 +288,27 @@ class Problem:
             out += pull
             cost += dot(change, pull) / 2
         return out, cost
+
+    def slide_along_views(self, step, u):
+        """Make a step of points along the mean view ray one of the surface, in place.
+
+        The equations hold what a point shows in each image; above a post, a surface that rises
+        meets another pixel. Where views differ, none of their ways is right, and the mean is best.
+
+        Parameters
+        ----------
+        step : float32 array (rows, cols), m
+        u : float32 array (rows, cols), m
+        """
+        lattice, at_nodes, frame, _, _ = self.geometry
+        lateral = np.zeros_like(frame.xyz)
+        for view in self.views:
+            to_camera = unit(view.position - frame.xyz)
+            rise = np.einsum("...i,...i", to_camera, frame.up)[..., None]
+            lateral += to_camera / np.maximum(rise, LOWEST_VIEW) - frame.up
+        crossed = self.surface.posts_crossed(lattice, at_nodes, lateral / len(self.views))
+        with threads_for(u.shape):
+            slide_along(step, u, (crossed - frame.drift).astype(np.float32), lattice.step)
 
     def sample_images(self, u):
         """Bring every image onto the cells of the surface ``u``."""

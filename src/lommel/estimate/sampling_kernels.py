@@ -80,6 +80,41 @@ def sample_cells(image, planes, step, u, reference, out):
             out[r, c] = sample_cubic(image, line, sample)
 
 
+@njit(cache=True, parallel=True, error_model="numpy", fastmath=FAST)
+def slide_along(step, u, planes, lattice_step):
+    """Turn a step of points along view rays into one of the surface above the posts, in place.
+
+    A point that rises by ``step`` towards the camera also moves sideways, and takes the slope of
+    the ground along: to first order what is left above its post is the step times one minus the
+    slope in that direction, per unit of rise.
+
+    Parameters
+    ----------
+    step : float32 array (rows, cols), m
+    u : float32 array (rows, cols), m
+        The surface.
+    planes : float32 array (2, node_rows, node_cols), posts per m
+        Rows and columns that rays to the camera cross per metre of rise.
+    lattice_step : int
+        Cells from node to node.
+    """
+    rows, cols = u.shape
+    for i in prange(rows):
+        r = np.int64(i)
+        upper, lower = max(r - 1, 0), min(r + 1, rows - 1)
+        at = np.empty((2, cols), np.float32)
+        centre = (min(r, rows - 2) + 0.5) / lattice_step
+        expand_row(planes[0], centre, lattice_step, at[0, : cols - 1])
+        expand_row(planes[1], centre, lattice_step, at[1, : cols - 1])
+        at[0, cols - 1], at[1, cols - 1] = at[0, cols - 2], at[1, cols - 2]
+        for c in range(cols):
+            left, right = max(c - 1, 0), min(c + 1, cols - 1)
+            by_row = (u[lower, c] - u[upper, c]) / np.float32(lower - upper)
+            by_col = (u[r, right] - u[r, left]) / np.float32(right - left)
+            share = np.float32(1.0) - at[0, c] * by_row - at[1, c] * by_col
+            step[r, c] *= min(max(share, np.float32(0.0)), np.float32(2.0))
+
+
 @njit(cache=True, parallel=True, fastmath=FAST)
 def cast_shadow(u, planes, step, highest, cells, darkest, out):
     """True on dark cells from which the way to the Sun meets terrain.

@@ -358,6 +358,8 @@ def _descend(level, u, steps, settings, history):
                 settings.max_cycles,
             )
             gain = dot(here.gradient, linear.x) / 2
+            if level.stride == 1:
+                level.slide_along_views(linear.x, start)
             step = without_tilt(linear.x) if settings.estimate_exposure else linear.x
             u = start + step
             here = _look(level, u)
