@@ -53,7 +53,7 @@ class AlbedoSettings:
     albedo_contrast: float = 0.075
     haze_error: float = 0.1
     masks: MaskSettings = field(default_factory=MaskSettings)
-    max_steps: int = 60
+    max_steps: int = 200
     tolerance: float = 1e-5
 
 

@@ -25,6 +25,7 @@ STEADY = 0.1  # the same for repetition and spread of haze, which the answer fee
 SETTLING = 8  # steps at most until the noise scale is kept; from there on the cost has a meaning
 TURNS = 8  # minimisations at most
 ALONE = 0.01  # repetition to start with: the noise scale is read where hardly a prior speaks
+ROUGH = 1e-3  # tolerance there: only the noise scale is kept
 LONGEST = 0.5  # change of any unknown in one step; all are logarithms or of order 1
 
 
@@ -48,13 +49,14 @@ def solve(problem, progress):
         levels / levels.mean(),
         np.zeros(problem.images),
         problem.blocks.brightness,
-        problem.shared_start,
+        _shared_start(problem),
     )
     point = visit(problem, state, np.log(levels.mean()), 1.0, ALONE)
     is_settled = settings.solver == "alternating" and settings.loss == "least-squares"
-    solution = _descend(problem, point, [], is_settled, progress)
     if settings.solver == "alternating":
-        return problem, solution
+        return problem, _descend(problem, point, [], is_settled, progress)
+    rough = replace(problem, settings=replace(settings, tolerance=max(ROUGH, settings.tolerance)))
+    solution = _descend(rough, point, [], is_settled, progress)
     for _ in range(TURNS):
         point = solution.value
         scale, repetition = weighting(point)
@@ -71,6 +73,19 @@ def solve(problem, progress):
             break
         problem = replace(problem, settings=replace(settings, haze_error=spread))
     return problem, solution
+
+
+def _shared_start(problem):
+    """The shared parameters expected, but c1 = 0 where it is fitted.
+
+    How steeply f falls with phase grows with c1 up to about its lunar value and shrinks beyond.
+    From there a step towards a flatter f may go either way, and the far way ends in a wrong
+    minimum; from 0 on there is one way.
+    """
+    start = problem.shared_start.copy()
+    if problem.is_fitted[OWN * problem.images]:
+        start[0] = 0.0
+    return start
 
 
 def weighting(point):
@@ -100,8 +115,9 @@ def _descend(problem, point, history, is_settled, progress):
             point, damping = trial, damping / 4
         else:
             damping = max(4 * damping, 1e-3)
+        counted = {"noise": scale, "repetition": point.repetition, "haze": settings.haze_error}
         history.append(
-            {"step": step + 1, "cost": point.objective, "change": change, "noise": scale}
+            {"step": step + 1, "cost": point.objective, "change": change, "counted_in": counted}
         )
         if abs(change) < settings.tolerance:
             return Solution(point, "converged", f"Converged after {step + 1} steps.", history)

@@ -225,8 +225,8 @@ def convergence(contents):
     history = contents.record["history"]
     if any("stride" in row for row in history):
         text += " Coarse levels come first: 1/8 is solved on every eighth post, on fewer cells."
-    if len({row.get("noise") for row in history}) > 1:
-        text += " Grey: the noise, in which the cost is counted, was still being estimated."
+    if any(row.get("counted_in") != history[-1].get("counted_in") for row in history):
+        text += " Grey: the noise or the haze that the cost counts with was still being estimated."
     words = "Cost after each step of the solver"
     return Claim("Convergence", text, (Panel("convergence", png, words),))
 

@@ -61,14 +61,14 @@ def draw_exposures(exposures):
 def draw_history(history):
     """Cost and size of each step.
 
-    Costs on different levels of a coarse-to-fine solve, or under another noise, are not comparable:
-    they are drawn apart, and in grey while the noise is not yet the final one.
+    Costs on different levels of a coarse-to-fine solve, or counted in another noise, are not
+    comparable: they are drawn apart, and in grey while the noise is not yet the final one.
 
     Parameters
     ----------
     history : list of dict
         Each with a ``cost``; where known, with ``change`` (relative) or ``step_m``, with the
-        ``stride`` of the level in posts, and with the ``noise`` that the cost is counted in.
+        ``stride`` of the level in posts, and with what the cost is ``counted_in``, a dict.
 
     Returns
     -------
@@ -78,13 +78,13 @@ def draw_history(history):
     if len(rows) < 2:
         return None
     steps, cost = np.arange(1, len(rows) + 1), np.array([row["cost"] for row in rows], float)
-    kinds = [(row.get("stride"), row.get("noise")) for row in rows]
+    kinds = [(row.get("stride"), *(row.get("counted_in") or {}).items()) for row in rows]
     with styled():
         figure = new_figure(PANEL_WIDTH, 3.4)
         axes = figure.add_subplot()
-        for stride, noise in dict.fromkeys(kinds):
-            kind = np.array([other == (stride, noise) for other in kinds])
-            colour = ACCENT if noise == kinds[-1][1] else UNSETTLED
+        for stride, *counted in dict.fromkeys(kinds):
+            kind = np.array([other == (stride, *counted) for other in kinds])
+            colour = ACCENT if counted == list(kinds[-1][1:]) else UNSETTLED
             axes.plot(steps[kind], cost[kind], color=colour, marker="o", markersize=4)
             if stride is not None:
                 note = {"xytext": (0, 7), "textcoords": "offset points", "fontsize": 7}
