@@ -76,7 +76,7 @@ class AlbedoResult:
     passes : int
         Over all images.
     history : list of dict
-        Cost and its change for each step from which the noise scale was kept.
+        Cost, its change and what it is counted in, for each step from which the noise was kept.
     outcome, advice : str
     """
 
@@ -178,7 +178,7 @@ def _result(solved, solution, problem, take):
     last_pass = LastPass(state, noise, problem.blocks.pixels, take or whole)
     visit(problem, state, point.mean_log_albedo, weighted_with, 1.0, last_pass)
     before, after = last_pass.disagreements()
-    groups = connected_groups(problem, point)
+    groups = connected_groups(solved, solution.value)
     indices = np.flatnonzero(used)
     return AlbedoResult(
         **(dict.fromkeys(MapRows.__annotations__) if whole is None else vars(whole.rows)),
@@ -209,7 +209,7 @@ def _remarks(problem, groups):
         return " One image only: its exposure is 1 by definition, nothing checks the albedo."
     if len(groups) > 1:
         return (
-            f" The images form {len(groups)} groups without overlap; the brightness of one against "
-            "the other rests on albedo_contrast alone."
+            f" The images form {len(groups)} groups that share no usable ground; the brightness of "
+            "one against the other rests on albedo_contrast alone."
         )
     return ""

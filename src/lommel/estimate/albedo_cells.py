@@ -7,9 +7,11 @@ cancel but for a difference of height across it:
 
 .. math:: \bar I = T A \bar R f v + b
 
-with means over the used posts of a cell. Where images are some thousand posts wide a cell is some
-hundred times smaller than the ground it replaces, and the steps of the solver cost nothing beside
-the one pass that makes the cells. Most callers want `cells_of`.
+with means over the used posts of a cell. A cell of which many posts are not used tells nothing:
+they are clipped or in shadow because of their brightness, and the mean of the others is not that of
+the ground. Where images are some thousand posts wide a cell is some hundred times smaller than the
+ground it replaces, and the steps of the solver cost nothing beside the one pass that makes the
+cells. Most callers want `cells_of`.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -21,10 +23,20 @@ from lommel.estimate.albedo_arrays import BLOCKS, Samples
 
 ACROSS = 32  # cells along an image: enough to see a lens, few enough to leave relief behind
 FULLNESS = 8  # power of the used share of a cell in its weight: parts of it are other ground
+WHOLE = 0.85  # least used share of a whole cell: 7 x 7 posts without one pixel and its neighbours
+LEAST = 0.01  # least share of an image in whole cells; an exposure read from less is a guess
+TOO_FEW = (
+    "{:.1f} % of it is free of shadow, clipped and missing pixels over squares of {} x {} posts; "
+    f"{100 * LEAST:g} % are needed to tell its exposure"
+)
 
 
 def cells_of(blocks):
     """Cells of the images, or the samples themselves where images are small.
+
+    Images with next to no whole cell are left out of the cells and of ``blocks``, with the reason.
+    Where this holds for all, holes are everywhere, and the samples themselves are the better
+    choice.
 
     Parameters
     ----------
@@ -36,7 +48,16 @@ def cells_of(blocks):
     """
     areas = blocks.windows[:, 2] * blocks.windows[:, 3]
     size = int(np.sqrt(np.median(areas)) / ACROSS)
-    return Cells(blocks, size) if size > 1 else blocks
+    if size < 2:
+        return blocks
+    cells = Cells(blocks, size)
+    is_told = cells.whole >= LEAST
+    if not is_told.any():
+        return blocks
+    if not is_told.all():
+        blocks.keep(is_told, [TOO_FEW.format(100 * share, size, size) for share in cells.whole])
+        cells.keep(is_told)
+    return cells
 
 
 class Cells:
@@ -47,6 +68,11 @@ class Cells:
     blocks : SampleBlocks
         Read once.
     size : int, posts
+
+    Attributes
+    ----------
+    whole, completeness : float64 array (images,)
+        Share of an image's window that its whole cells cover; the same over the largest of all.
     """
 
     def __init__(self, blocks, size):
@@ -64,6 +90,14 @@ class Cells:
                     top = row - self.windows[k, 0]
                     sums[k][:, top : top + values.shape[1]] += values
         self.images = [_means(image, size**2) for image in sums]
+        self.whole = np.array([np.mean(image[4] > 0) for image in self.images])
+        self.completeness = self.whole / max(self.whole.max(), 1e-300)
+
+    def keep(self, is_kept):
+        """Leave out the images of which ``is_kept`` is False."""
+        for name in ("levels", "brightness", "windows", "whole", "completeness"):
+            setattr(self, name, getattr(self, name)[is_kept])
+        self.images = [image for image, kept in zip(self.images, is_kept, strict=True) if kept]
 
     def span(self, block):
         """First row of a block, and the row behind its last one."""
@@ -116,7 +150,8 @@ def _means(sums, posts):
     used, weight, variance, *given = sums
     safe = np.maximum(used, 1.0)
     measured, reflectance, phase, off_axis = (plane / safe for plane in given)
-    weight = weight / safe * (used / posts) ** (1 + FULLNESS)
+    share = np.where(used >= WHOLE * posts, used / posts, 0.0)
+    weight = weight / safe * share ** (1 + FULLNESS)
     precision = np.divide(used, variance, out=np.zeros_like(used), where=used > 0)
     planes = measured, reflectance, phase, off_axis, weight, precision
     return np.stack(planes).astype(np.float32)

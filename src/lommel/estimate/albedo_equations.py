@@ -60,6 +60,15 @@ class Problem:
         """Number of images used."""
         return len(self.blocks.levels)
 
+    @property
+    def haze_errors(self):
+        """Expected spread of the haze of each image, as a share of its level.
+
+        Its square goes with the completeness: where clipping and shadow leave few whole cells, they
+        have cut one end of the contrast that haze is told by, which itself looks like haze.
+        """
+        return self.settings.haze_error * np.sqrt(self.blocks.completeness)
+
 
 @dataclass(eq=False)
 class Point:
@@ -152,7 +161,7 @@ def priors(problem, point):
     error = np.concatenate(
         [
             np.full(images, settings.albedo_contrast),
-            np.full(images, settings.haze_error),
+            problem.haze_errors,
             SHARED_ERROR,
         ]
     )
@@ -282,10 +291,14 @@ def haze_spread(problem, point, most):
     r"""Standard deviation of haze from image to image that the images themselves show.
 
     One step towards the largest evidence (MacKay 1992, Neural Comput. 4, 415-447): with the hazes
-    :math:`h_k = b^k / \ell^k`, their standard errors :math:`e_k` and the spread :math:`\sigma_b`
-    that was expected,
+    :math:`h_k = b^k / \ell^k`, their standard errors :math:`e_k` and what was expected,
+    :math:`\sigma_b \sqrt{c_k}` with the completeness :math:`c_k`,
 
-    .. math:: \sigma_b^2 \leftarrow \sum_k h_k^2 \big/ \sum_k (1 - e_k^2 / \sigma_b^2)
+    .. math:: \sigma_b^2 \leftarrow 1.4826^2 \operatorname{median}_k \frac{h_k^2}{c_k \gamma_k},
+              \qquad \gamma_k = 1 - \frac{e_k^2}{c_k \sigma_b^2}
+
+    Images count by :math:`\gamma_k`, how much of their haze they tell themselves. It is a median in
+    place of MacKay's mean, so that a few images with a feigned haze do not permit it to the others.
 
     Parameters
     ----------
@@ -298,13 +311,17 @@ def haze_spread(problem, point, most):
     -------
     spread : float, share of an image's level
     """
-    expected = problem.settings.haze_error
+    expected = problem.haze_errors
     if not problem.settings.haze:
-        return expected
+        return problem.settings.haze_error
     errors = standard_errors(problem, point)[1 : OWN * problem.images : OWN]
-    known = np.sum(1.0 - np.minimum(errors / expected, 1.0) ** 2)
-    square = np.sum((point.state.haze / point.state.level) ** 2)
-    return float(np.clip(np.sqrt(square / max(known, 1e-9)), min(LEAST_HAZE, most), most))
+    known = np.maximum(1.0 - (errors / expected) ** 2, 1e-9)
+    share = point.state.haze / point.state.level
+    square = share**2 / (problem.blocks.completeness * known)
+    order = np.argsort(square)
+    middle = np.cumsum(known[order]) - 0.5 * known[order]
+    median = np.interp(0.5 * known.sum(), middle, square[order])
+    return float(np.clip(1.4826 * np.sqrt(median), min(LEAST_HAZE, most), most))
 
 
 def connected_groups(problem, point):

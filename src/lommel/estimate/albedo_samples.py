@@ -134,6 +134,8 @@ class SampleBlocks:
     windows : int64 array (used images, 4)
     levels, brightness : float64 array (used images,), image units
         Weighted mean of the used pixels, over that of the reflectance and as it is.
+    completeness : float64 array (used images,)
+        1: every image tells its haze; see `lommel.estimate.albedo_cells.Cells`.
     reasons : list of str
         One per observation, empty where it is used.
     """
@@ -155,10 +157,22 @@ class SampleBlocks:
         self.frames = [frames[k] for k in used]
         windows = [(w.row, w.col, w.rows, w.cols) for w in (f.window for f in self.frames)]
         self.windows = np.array(windows, np.int64).reshape(-1, 4)
+        self.completeness = np.ones(len(used))
         self.pixels = int(np.sum(self.windows[:, 2] * self.windows[:, 3]))
         self.count = max(BLOCKS, -(-self.pixels // PIXELS_AT_ONCE))
         kept_pixels = KEPT_PIXELS if kept_pixels is None else kept_pixels
         self._kept = {} if self.pixels <= kept_pixels else None
+
+    def keep(self, is_kept, reasons):
+        """Leave out the used images of which ``is_kept`` is False, each for its reason."""
+        used = [k for k, reason in enumerate(self.reasons) if not reason]
+        for k, kept, reason in zip(used, is_kept, reasons, strict=True):
+            self.reasons[k] = "" if kept else reason
+        for name in ("levels", "brightness", "windows", "completeness"):
+            setattr(self, name, getattr(self, name)[is_kept])
+        self.frames = [frame for frame, kept in zip(self.frames, is_kept, strict=True) if kept]
+        self.pixels = int(np.sum(self.windows[:, 2] * self.windows[:, 3]))
+        self._kept = None if self._kept is None else {}
 
     def span(self, block):
         """First row of a block, and the row behind its last one."""
