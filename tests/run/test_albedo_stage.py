@@ -99,9 +99,11 @@ def test_table_lists_every_image_with_errors(product, ground):
         "haze",
         "haze_error",
         "used",
+        "group",
         "reason",
     ]
     assert all(float(row["exposure_error"]) > 0 and row["used"] == "1" for row in table)
+    assert {row["group"] for row in table} == {"1"}
     assert np.mean([float(row["exposure"]) for row in table]) == pytest.approx(1.0)
 
 
@@ -149,6 +151,7 @@ def test_black_image_is_left_out_and_the_run_goes_on(ground, tmp_path):
     assert results["images"] == len(ground.images) - 1
     row = read_table(tmp_path / "out" / "exposures.csv")[2]
     assert row["used"] == "0"
+    assert row["group"] == ""
     assert "every pixel is shadow" in row["reason"]
 
 

@@ -112,7 +112,9 @@ def run_albedo(
 
 
 def _write_exposures(path, names, result, skipped):
-    header = ["image", "exposure", "exposure_error", "haze", "haze_error", "used", "reason"]
+    header = ["image", "exposure", "exposure_error", "haze", "haze_error"]
+    header += ["used", "group", "reason"]
+    groups = {k: number for number, group in enumerate(result.groups, 1) for k in group}
     table = zip(
         names,
         result.exposures,
@@ -125,11 +127,11 @@ def _write_exposures(path, names, result, skipped):
     with open(path, "w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(header)
-        for name, *numbers, reason in table:
+        for k, (name, *numbers, reason) in enumerate(table):
             values = ["" if reason else f"{float(number):.8g}" for number in numbers]
-            writer.writerow([name, *values, 0 if reason else 1, reason])
+            writer.writerow([name, *values, 0 if reason else 1, groups.get(k, ""), reason])
         for skip in skipped:
-            writer.writerow([skip.name, "", "", "", "", 0, skip.reason])
+            writer.writerow([skip.name, "", "", "", "", 0, "", skip.reason])
 
 
 def _results(scene, result, products):
