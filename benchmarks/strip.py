@@ -5,7 +5,8 @@
 The cameras are those of `lommel simulate` (Apollo's Metric camera at 110 km, 75 % overlap); the
 ground is fractal relief and albedo made of two periodic fields, so that it needs no memory; images
 have 8 bits, noise, and exposures that differ by 30 %. The DEM lacks the finest relief. Prints the
-seconds, the peak memory, the passes and the errors of the exposures.
+seconds, the peak memory, the passes and the errors of the exposures. Where the Sun stands high,
+images of long exposure clip on most of their ground, where it stands low, they lie in shadow.
 """
 
 import argparse
@@ -30,7 +31,6 @@ from lommel.simulate.settings import GridSettings, OrbitSettings, SunSettings
 
 CRS = "+proj=eqc +lat_ts=8.9 +lon_0=26 +R=1737400 +units=m +no_defs"
 PERIODS = 2048, 1792  # posts, of the two fields
-SUN = SunSettings(longitude_deg=70.0)
 RELIEF, CONTRAST, SWELL = 12.0, 0.08, 0.15  # posts rms; rms of log albedo, fine and along the strip
 NOISE, EXPOSURE, SPREAD = 0.0075, 220.0, 0.3
 ROWS = 256  # of images made at once
@@ -39,7 +39,7 @@ ROWS = 256  # of images made at once
 class Ground:
     """Relief and albedo at any posts; ``blur`` in posts takes the finest relief away."""
 
-    def __init__(self, spacing, seed=5):
+    def __init__(self, spacing, seed):
         rng = np.random.default_rng(seed)
         self.fields = [_fractal(period, 1.9, 0.0, rng) for period in PERIODS]
         self.known = [_blurred(field, 1.5) for field in self.fields]
@@ -76,22 +76,22 @@ def _tiled(fields, rows, cols):
     )
 
 
-def make_strip(folder, frames, size):
-    """Write images, DEM, position tables and the true exposures of a strip."""
+def make_strip(folder, frames, size, seed, sun_longitude):
+    """Write images, DEM and position tables of a strip; returns the grid and the exposures."""
     orbit = OrbitSettings(frames=frames)
     cameras = frame_cameras(orbit, GridSettings())
     spacing = 2 * footprint_half_angle(orbit) * MOON.radius / size
     outlines = np.array([_bounds(camera) for camera in cameras])
     bounds = *outlines[:, :2].min(axis=0), *outlines[:, 2:].max(axis=0)
     grid = grid_from_bounds(bounds, spacing, read_crs(CRS))
-    ground = Ground(spacing)
+    ground = Ground(spacing, seed)
     with raster_writer(folder / "dem.tif", grid, "height", "m") as write:
         for first in range(0, grid.shape[0], ROWS):
             rows = range(first, min(first + ROWS, grid.shape[0]))
             cols = range(grid.shape[1])
             write(ground.heights(rows, cols, True), Window(first, 0, len(rows), len(cols)))
     exposures = EXPOSURE * (1 + SPREAD * np.random.default_rng(9).uniform(-1, 1, frames))
-    sun = sun_position(SUN)
+    sun = sun_position(SunSettings(longitude_deg=sun_longitude))
 
     def take(k):
         window = grid_from_bounds(outlines[k], spacing, grid.crs).footprint(grid)
@@ -151,12 +151,15 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=40)
     parser.add_argument("--size", type=int, default=1000, help="posts along a frame")
+    parser.add_argument("--seed", type=int, default=5, help="of the ground")
+    parser.add_argument("--sun-longitude", type=float, default=70.0, help="deg; the strip is at 26")
     parser.add_argument("--folder", type=Path, default=Path("benchmarks/output/strip"))
     parser.add_argument("options", nargs="*", help="of lommel albedo, after --")
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
-    grid, truth = make_strip(given.folder, given.frames, given.size)
+    strip = given.frames, given.size, given.seed, given.sun_longitude
+    grid, truth = make_strip(given.folder, *strip)
     print(f"made {grid.shape} posts in {time.perf_counter() - start:.0f} s", flush=True)
     images = sorted(str(path) for path in given.folder.glob("frame*.tif"))
     output = given.folder / "albedo"
@@ -172,11 +175,25 @@ def main():
     for stage in record["stages"]:
         print(f"  {stage['name']}: {stage['seconds']:.0f} s, {stage['peak_memory_mb']:.0f} MB")
     print(f"  {record['results']['passes']} passes; {record['outcome']['sentence']}")
-    with open(output / "exposures.csv", encoding="utf-8") as file:
-        ratio = [float(r["exposure"]) / truth[Path(r["image"]).stem] for r in csv.DictReader(file)]
+    report_exposures(output / "exposures.csv", truth)
+
+
+def report_exposures(path, truth):
+    """Print how far the exposures are off, along the strip and in groups that share ground."""
+    with open(path, encoding="utf-8") as file:
+        table = [row for row in csv.DictReader(file) if row["used"] == "1"]
+    frame = {name: k for k, name in enumerate(truth)}
+    place = np.array([frame[Path(row["image"]).stem] for row in table]) / max(len(truth) - 1, 1)
+    ratio = [float(row["exposure"]) / truth[Path(row["image"]).stem] for row in table]
     error = np.log(ratio) - np.mean(np.log(ratio))
-    drift = np.polyfit(np.linspace(-0.5, 0.5, len(error)), error, 1)[0] if len(error) > 1 else 0.0
+    drift = np.polyfit(place, error, 1)[0] if len(error) > 1 else 0.0
     print(f"  exposures: {100 * error.std():.2f} % rms, drift {100 * drift:.2f} % along the strip")
+    groups = np.array([int(row["group"]) for row in table])
+    apart = np.concatenate([error[groups == g] - error[groups == g].mean() for g in set(groups)])
+    print(
+        f"  {len(truth) - len(table)} of {len(truth)} images left out; {len(set(groups))} groups, "
+        f"{100 * apart.std():.2f} % rms about the mean of each"
+    )
 
 
 if __name__ == "__main__":
