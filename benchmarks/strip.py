@@ -33,6 +33,7 @@ CRS = "+proj=eqc +lat_ts=8.9 +lon_0=26 +R=1737400 +units=m +no_defs"
 PERIODS = 2048, 1792  # posts, of the two fields
 RELIEF, CONTRAST, SWELL = 12.0, 0.08, 0.15  # posts rms; rms of log albedo, fine and along the strip
 NOISE, EXPOSURE, SPREAD = 0.0075, 220.0, 0.3
+METERED, LEAST_COSINE = 110.0, 0.05  # mean brightness that an exposure control aims at; of the Sun
 ROWS = 256  # of images made at once
 
 
@@ -76,7 +77,7 @@ def _tiled(fields, rows, cols):
     )
 
 
-def make_strip(folder, frames, size, seed, sun_longitude):
+def make_strip(folder, frames, size, seed, sun_longitude, metered=False):
     """Write images, DEM and position tables of a strip; returns the grid and the exposures."""
     orbit = OrbitSettings(frames=frames)
     cameras = frame_cameras(orbit, GridSettings())
@@ -92,6 +93,8 @@ def make_strip(folder, frames, size, seed, sun_longitude):
             write(ground.heights(rows, cols, True), Window(first, 0, len(rows), len(cols)))
     exposures = EXPOSURE * (1 + SPREAD * np.random.default_rng(9).uniform(-1, 1, frames))
     sun = sun_position(SunSettings(longitude_deg=sun_longitude))
+    if metered:
+        exposures *= [METERED / (EXPOSURE * _reflectance(camera, sun)) for camera in cameras]
 
     def take(k):
         window = grid_from_bounds(outlines[k], spacing, grid.crs).footprint(grid)
@@ -106,6 +109,14 @@ def make_strip(folder, frames, size, seed, sun_longitude):
         ]
         (folder / f"{kind}.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return grid, dict(zip(names, exposures, strict=True))
+
+
+def _reflectance(camera, sun):
+    """Of level ground below a camera."""
+    up = camera.position / np.linalg.norm(camera.position)
+    to_sun = sun / np.linalg.norm(sun)
+    cosine = max(float(up @ to_sun), LEAST_COSINE)
+    return float(reflectance_model("lunar-lambert").reflectance(cosine, 1.0, np.arccos(cosine)))
 
 
 def _bounds(camera):
@@ -153,12 +164,15 @@ def main():
     parser.add_argument("--size", type=int, default=1000, help="posts along a frame")
     parser.add_argument("--seed", type=int, default=5, help="of the ground")
     parser.add_argument("--sun-longitude", type=float, default=70.0, help="deg; the strip is at 26")
+    parser.add_argument(
+        "--metered", action="store_true", help="exposures follow the Sun's height, so nothing clips"
+    )
     parser.add_argument("--folder", type=Path, default=Path("benchmarks/output/strip"))
     parser.add_argument("options", nargs="*", help="of lommel albedo, after --")
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
-    strip = given.frames, given.size, given.seed, given.sun_longitude
+    strip = given.frames, given.size, given.seed, given.sun_longitude, given.metered
     grid, truth = make_strip(given.folder, *strip)
     print(f"made {grid.shape} posts in {time.perf_counter() - start:.0f} s", flush=True)
     images = sorted(str(path) for path in given.folder.glob("frame*.tif"))
