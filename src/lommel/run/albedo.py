@@ -16,6 +16,7 @@ from lommel.estimate.albedo_quality import (
     slope_towards_sun,
 )
 from lommel.estimate.albedo_settings import AlbedoSettings, published_settings
+from lommel.progress import silent
 from lommel.run.albedo_products import Products
 from lommel.run.inputs import GridSettings, SceneFiles, Skipped
 from lommel.run.mixed_scene import raw_cameras, read_mixed_scene
@@ -57,7 +58,7 @@ def run_albedo(
     settings: AlbedoSettings | None = None,
     grid_settings: GridSettings | None = None,
     overwrite: bool = False,
-    progress=iter,
+    progress=silent,
     registers: bool = False,
 ):
     """Estimate albedo and exposures from orthoimages or raw images and write the products.
@@ -71,7 +72,7 @@ def run_albedo(
     grid_settings : GridSettings, optional
     overwrite : bool
     progress : callable
-        Wraps the iterable of images.
+        Shows how far each step is; see `lommel.progress.silent`.
     registers : bool
         Register raw images to the DEM first; otherwise they are only checked.
 
@@ -88,7 +89,9 @@ def run_albedo(
     )
     with output_folder(output, overwrite) as folder, closing(RowStore(folder)) as store:
         with record.stage("read"):
-            settled, lost, remark = settle_cameras(files, folder, registers, raw_cameras(files))
+            settled, lost, remark = settle_cameras(
+                files, folder, registers, raw_cameras(files), progress
+            )
             scene = read_mixed_scene(settled, grid_settings, progress=progress, store=store)
             record.add_inputs([*files.images, *files.dems, *files.cameras])
             tables = (files.sun_positions, files.spacecraft_positions)

@@ -13,6 +13,7 @@ import numpy as np
 from lommel.errors import GeometryError, InputError, LommelError, UnreadableError
 from lommel.io.positions import find_position, read_positions
 from lommel.io.raster import raster_info, read_grid, read_image_on_grid, read_on_grid
+from lommel.progress import silent
 from lommel.scene.body import MOON
 from lommel.scene.geometry import Observation
 from lommel.scene.grid import Grid, Window, bounds_in, grid_from_bounds, read_crs
@@ -106,7 +107,7 @@ def read_scene(
     grid_settings=None,
     prefer="images",
     body=MOON,
-    progress=iter,
+    progress=silent,
     store=None,
     is_part=False,
 ):
@@ -121,7 +122,7 @@ def read_scene(
         Whose posts the automatic grid takes over.
     body : Body
     progress : callable
-        Wraps the iterable of images, as ``rich.progress.track`` does.
+        Shows how far each step is; see `lommel.progress.silent`.
     store : function (observation), optional
         Gives each observation back when it is read, its image perhaps stored elsewhere.
     is_part : bool
@@ -147,7 +148,7 @@ def read_scene(
     refuse_unusable(grid)
     heights = read_heights(files.dems, grid, body)
     observations = []
-    for path in progress(list(image_grids)):
+    for path in progress(list(image_grids), "images"):
         try:
             seen = observe(path, image_grids[path], grid, heights, tables, body)
             observations.append(store(seen))

@@ -11,6 +11,7 @@ import numpy as np
 from lommel.errors import GeometryError, InputError, LommelError
 from lommel.io.cameras import find_camera
 from lommel.io.raster import raster_info
+from lommel.progress import silent
 from lommel.run.inputs import (
     GridSettings,
     Scene,
@@ -31,7 +32,7 @@ from lommel.scene.body import MOON
 from lommel.scene.geometry import Observation
 
 
-def read_mixed_scene(files, grid_settings=None, body=MOON, progress=iter, store=None):
+def read_mixed_scene(files, grid_settings=None, body=MOON, progress=silent, store=None):
     """Terrain, orthoimages and raw images on one grid.
 
     Parameters
@@ -40,7 +41,7 @@ def read_mixed_scene(files, grid_settings=None, body=MOON, progress=iter, store=
     grid_settings : GridSettings, optional
     body : Body
     progress : callable
-        Wraps the iterable of images, as ``rich.progress.track`` does.
+        Shows how far each step is; see `lommel.progress.silent`.
     store : function (observation), optional
         As in `read_scene`.
 
@@ -71,7 +72,7 @@ def read_mixed_scene(files, grid_settings=None, body=MOON, progress=iter, store=
     refuse_unusable(grid)
     heights = read_heights(files.dems, grid, body)
     found = {}
-    for task in progress([*placed, *flat_grids.items()]):
+    for task in progress([*placed, *flat_grids.items()], "images"):
         path = task[0].path if len(task) == 3 else task[0]
         try:
             if len(task) == 3:
