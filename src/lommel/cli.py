@@ -128,10 +128,23 @@ def albedo(
     spacing: Spacing = None,
     crs: Crs = None,
     bounds: Bounds = None,
+    memory: Annotated[
+        str | None,
+        typer.Option(
+            help="What the run may take, like 8GB; the products are the same. "
+            "Default: 60 % of what is free."
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show passes, memory, disk and time; solve nothing.")
+    ] = False,
     overwrite: Overwrite = False,
 ):
     """Albedo map and exposures from overlapping images, projected or with cameras, and a DEM."""
     from lommel.run.albedo import albedo_settings, run_albedo
+    from lommel.run.albedo_plan import plan_albedo
+    from lommel.run.mixed_scene import place_scene
+    from lommel.run.tiles_plan import read_memory
 
     settings = albedo_settings(
         solver=solver,
@@ -144,10 +157,13 @@ def albedo(
         shadow_threshold=shadow_threshold,
     )
     files = _files(images, dem, sun_positions, spacecraft_positions, positions_unit, cameras)
+    grid = _grid(spacing, crs, bounds)
+    size = None if memory is None else read_memory(memory)
+    if dry_run:
+        typer.echo(plan_albedo(place_scene(files, grid), settings, size))
+        return
     with _progress() as progress:
-        run_albedo(
-            files, output, settings, _grid(spacing, crs, bounds), overwrite, progress, registers
-        )
+        run_albedo(files, output, settings, grid, overwrite, progress, registers, size)
     _finish(output)
 
 

@@ -46,8 +46,7 @@ def cells_of(blocks):
     -------
     blocks : Cells or SampleBlocks
     """
-    areas = blocks.windows[:, 2] * blocks.windows[:, 3]
-    size = int(np.sqrt(np.median(areas)) / ACROSS)
+    size = cell_size(blocks.windows)
     if size < 2:
         return blocks
     cells = Cells(blocks, size)
@@ -58,6 +57,16 @@ def cells_of(blocks):
         blocks.keep(is_told, [TOO_FEW.format(100 * share, size, size) for share in cells.whole])
         cells.keep(is_told)
     return cells
+
+
+def cell_size(windows):
+    """Posts along a cell; 1 or less where images are too small for cells.
+
+    Parameters
+    ----------
+    windows : int64 array (images, 4)
+    """
+    return int(np.sqrt(np.median(windows[:, 2] * windows[:, 3])) / ACROSS)
 
 
 class Cells:

@@ -108,7 +108,6 @@ def read_scene(
     prefer="images",
     body=MOON,
     progress=silent,
-    store=None,
     is_part=False,
 ):
     """Terrain and images on one grid.
@@ -123,8 +122,6 @@ def read_scene(
     body : Body
     progress : callable
         Shows how far each step is; see `lommel.progress.silent`.
-    store : function (observation), optional
-        Gives each observation back when it is read, its image perhaps stored elsewhere.
     is_part : bool
         The images have been read before, for all of the scene: one that cannot be read now is no
         longer left out, but an `UnreadableError`.
@@ -133,7 +130,6 @@ def read_scene(
     -------
     scene : Scene
     """
-    store = store or _as_it_is
     refuse_duplicates(files.images)
     if not files.dems:
         raise InputError("No DEM given. Name at least one with --dem.")
@@ -150,8 +146,7 @@ def read_scene(
     observations = []
     for path in progress(list(image_grids), "images"):
         try:
-            seen = observe(path, image_grids[path], grid, heights, tables, body)
-            observations.append(store(seen))
+            observations.append(observe(path, image_grids[path], grid, heights, tables, body))
         except LommelError as error:
             skipped.append(left_out(path, error, is_part))
     if not observations:
@@ -259,10 +254,6 @@ def _mean_heights(paths, grid, body):
         total[window.slices] += np.where(known, part, 0.0)
         count[window.slices] += known
     return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
-
-
-def _as_it_is(observation):
-    return observation
 
 
 def left_out(path, error, is_part):
