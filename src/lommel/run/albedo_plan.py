@@ -6,6 +6,7 @@ there are at a time and what is kept between passes. Most callers want `plan_alb
 
 from contextlib import contextmanager
 from dataclasses import dataclass
+from math import ceil
 
 import numpy as np
 from numba import get_num_threads, set_num_threads
@@ -132,8 +133,8 @@ def plan_albedo(placed, settings, memory=None):
     if given < least:
         raise InputError(
             f"--memory {given / 1e9:.2f} GB is too little: {shape[0]} x {shape[1]} posts and "
-            f"{images} images need {least / 1e9:.2f} GB. Give that, a larger --spacing, narrower "
-            "--bounds or fewer images."
+            f"{images} images need {ceil(least / 1e7) / 100:.2f} GB. Give that, a larger "
+            "--spacing, narrower --bounds or fewer images."
         )
     threads = int(min(get_num_threads(), max(1, (given - always) // per_thread)))
     used = max(least, always + threads * per_thread)
