@@ -41,7 +41,7 @@ def test_lines_come_once_a_minute_whatever_the_number_of_parts(log):
 def test_lines_of_one_step_after_the_other_keep_apart(log):
     clock, lines, progress = log
     for number in range(10):
-        for _ in progress(range(100), f"pass {number + 1}"):
+        for _ in progress(range(100), f"pass {number + 1}, block"):
             clock.now += 0.04
     assert lines == []  # ten times 4 s
     with step(progress, "coarse grid"):

@@ -19,7 +19,7 @@ from lommel.run.albedo_records import work_folder
 from lommel.run.mixed_scene import Place, PlacedScene, place_scene
 from lommel.scene.grid import Window, grid_from_bounds, read_crs
 
-from .albedo_scene import files_of, own_photometry
+from .albedo_scene import few_steps, files_of
 
 PRODUCTS = ("albedo.tif", "orthomosaic.tif", "count.tif", "residual.tif", "exposures.csv")
 
@@ -38,7 +38,7 @@ def content(folder):
 
 @pytest.fixture
 def unbroken(ground, tmp_path):
-    run_albedo(files_of(ground), tmp_path / "unbroken", own_photometry())
+    run_albedo(files_of(ground), tmp_path / "unbroken", few_steps())
     return content(tmp_path / "unbroken")
 
 
@@ -60,7 +60,7 @@ def test_memory_does_not_change_the_products(ground, tmp_path, monkeypatch, unbr
     for name, size in (("little", 0.36e9), ("some", 1e9), ("all", 1e12)):
         if name == "all":
             monkeypatch.setattr(albedo_plan, "HELD_BYTES", 2**26)
-        run_albedo(files_of(ground), tmp_path / name, own_photometry(), memory=size)
+        run_albedo(files_of(ground), tmp_path / name, few_steps(), memory=size)
         assert content(tmp_path / name) == unbroken
         assert not work_folder(tmp_path / name).exists()
     assert [plan.waits_on_disk for plan in plans] == [True, True, False]
@@ -75,7 +75,7 @@ from lommel.run import albedo_plan, mixed_scene
 from lommel.estimate import albedo_samples
 from lommel.run.albedo import run_albedo
 sys.path.insert(0, sys.argv[1])
-from albedo_scene import files_of, own_photometry
+from albedo_scene import files_of, few_steps
 from lommel.run.simulate import SceneFolder
 
 albedo_plan.HELD_BYTES, albedo_samples.PIXELS_AT_ONCE, mixed_scene.POSTS_AT_ONCE = 0, 1000, 300
@@ -87,7 +87,7 @@ def progress(items, name, total=None, at_once=1):
         yield item
 
 files = files_of(SceneFolder(Path(sys.argv[2])))
-run_albedo(files, sys.argv[3], own_photometry(), progress=progress)
+run_albedo(files, sys.argv[3], few_steps(), progress=progress)
 """
 
 
@@ -104,30 +104,43 @@ def test_killed_run_goes_on_where_it_was(ground, tmp_path, unbroken):
     kept = {path.name for path in work_folder(output).glob("[!.]*")}
     assert kept == {"heights", "image-00000", "image-00001", "image-00002"}
     written = {name: (work_folder(output) / name / "rows").stat().st_mtime_ns for name in kept}
-    kill_within(ground, output, "maps")
+    kill_within(ground, output, "maps, block")
     assert {
         name: (work_folder(output) / name / "rows").stat().st_mtime_ns for name in kept
     } == written
     steps = Steps()
-    run_albedo(files_of(ground), output, own_photometry(), progress=steps)
+    run_albedo(files_of(ground), output, few_steps(), progress=steps)
     assert content(output) == unbroken
-    assert "terrain" not in steps and "pass 1" not in steps and "maps" in steps
+    assert "terrain" not in steps and "pass 1, block" not in steps and "maps, block" in steps
     assert not work_folder(output).exists()
 
 
-def test_other_settings_or_inputs_begin_anew(ground, tmp_path):
-    output = tmp_path / "out"
-    kill_within(ground, output, "maps")
-    steps, settings = Steps(), replace(own_photometry(), haze=False)
-    run_albedo(files_of(ground), output, settings, progress=steps)
-    assert {"terrain", "pass 1", "maps"} <= set(steps)
-    kill_within(ground, tmp_path / "fewer", "maps")
-    steps.clear()
-    fewer = files_of(ground, ground.images[:-1])
-    run_albedo(fewer, tmp_path / "fewer", own_photometry(), progress=steps)
-    assert {"terrain", "pass 1", "maps"} <= set(steps)
-    run_albedo(fewer, tmp_path / "fresh", own_photometry())
-    assert content(tmp_path / "fewer") == content(tmp_path / "fresh")
+def break_off(files, output):
+    """A run that ends when the maps begin."""
+
+    def progress(items, name, total=None, at_once=1):
+        if name == "maps, block":
+            raise KeyboardInterrupt
+        return items
+
+    with pytest.raises(KeyboardInterrupt):
+        run_albedo(files, output, few_steps(), progress=progress)
+    assert (work_folder(output) / "photometry").is_dir() and not output.exists()
+
+
+@pytest.mark.parametrize("change", ["settings", "inputs"])
+def test_other_settings_or_inputs_begin_anew(ground, tmp_path, change):
+    output, files, settings = tmp_path / "out", files_of(ground), few_steps()
+    break_off(files, output)
+    if change == "settings":
+        settings = replace(settings, haze=False)
+    else:
+        files = files_of(ground, ground.images[:-1])
+    steps = Steps()
+    run_albedo(files, output, settings, progress=steps)
+    assert {"terrain", "pass 1, block", "maps, block"} <= set(steps)
+    run_albedo(files, tmp_path / "fresh", settings)
+    assert content(output) == content(tmp_path / "fresh")
 
 
 def test_photometry_comes_back_to_the_last_bit(ground, tmp_path, monkeypatch):
@@ -139,7 +152,7 @@ def test_photometry_comes_back_to_the_last_bit(ground, tmp_path, monkeypatch):
         return found[1]
 
     monkeypatch.setattr(albedo_records.Kept, "photometry", twice)
-    run_albedo(files_of(ground), tmp_path / "out", own_photometry())
+    run_albedo(files_of(ground), tmp_path / "out", few_steps())
     fresh, read = (dict(vars(photometry)) for photometry in found)
     for one, other in zip(fresh.pop("state"), read.pop("state"), strict=True):
         np.testing.assert_array_equal(one, other)
@@ -152,16 +165,16 @@ def test_disk_without_room_is_told_before_images_are_read(ground, tmp_path, monk
     monkeypatch.setattr(albedo_plan, "DISK_PER_POST", 1e15)
     steps = Steps()
     with pytest.raises(LommelError, match=r"\.albedo has \d.* MB free, \d.* MB are needed"):
-        run_albedo(files_of(ground), tmp_path / "out", own_photometry(), progress=steps)
+        run_albedo(files_of(ground), tmp_path / "out", few_steps(), progress=steps)
     assert "images" not in steps
 
 
 def test_least_memory_is_named_and_is_enough(ground):
     placed = place_scene(files_of(ground))
     with pytest.raises(InputError, match=r"--memory 0\.00 GB is too little.* need ") as error:
-        plan_albedo(placed, own_photometry(), 1e6)
+        plan_albedo(placed, few_steps(), 1e6)
     least = 1e9 * float(re.search(r"need ([0-9.]+) GB", str(error.value))[1])
-    assert plan_albedo(placed, own_photometry(), least).memory <= least
+    assert plan_albedo(placed, few_steps(), least).memory <= least
 
 
 @pytest.mark.parametrize("side", [10_000, 30_000])
@@ -177,7 +190,7 @@ def test_least_memory_does_not_grow_with_the_scene(side, monkeypatch):
     windows = [Window(row, col, 10_000, 10_000) for row in starts for col in starts]
     places = [Place("image", window) for window in windows for _ in range(4)]
     placed = PlacedScene(grid, None, places, [], [])
-    plan = plan_albedo(placed, own_photometry(), 1e9)
+    plan = plan_albedo(placed, few_steps(), 1e9)
     assert plan.memory <= 1e9 and plan.waits_on_disk and plan.passes == 4
     assert plan.pixels == 4 * side**2 and plan.kept_pixels < 1e8
     assert "memory   1.00 GB" in str(plan) and "images   " in str(plan)

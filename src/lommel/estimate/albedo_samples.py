@@ -210,14 +210,14 @@ class SampleBlocks:
         visit : function (block)
             Called from several threads.
         name : str, optional
-            Of the pass; its number by default.
+            Of the pass; by default its number.
 
         Yields
         ------
         result : object
         """
         self.passes += 1
-        name = name or f"pass {self.passes}"
+        name = f"{name or f'pass {self.passes}'}, block"
         with ThreadPoolExecutor(get_num_threads()) as threads:
             results = threads.map(visit, range(self.count))
             yield from self.progress(results, name, self.count, get_num_threads())
