@@ -57,7 +57,7 @@ def test_memory_does_not_change_the_products(ground, tmp_path, monkeypatch, unbr
         albedo_plan.AlbedoPlan, "limits", lambda plan: plans.append(plan) or original(plan)
     )
     monkeypatch.setattr(albedo_plan, "SAMPLE", 24e4)  # as if a pixel took so much
-    for name, size in (("little", 0.36e9), ("some", 1e9), ("all", 1e12)):
+    for name, size in (("little", 0.57e9), ("some", 1e9), ("all", 1e12)):
         if name == "all":
             monkeypatch.setattr(albedo_plan, "HELD_BYTES", 2**26)
         run_albedo(files_of(ground), tmp_path / name, few_steps(), memory=size)

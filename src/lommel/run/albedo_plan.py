@@ -18,16 +18,14 @@ from lommel.estimate.albedo_samples import block_edges
 from lommel.estimate.albedo_settings import check_settings
 from lommel.run.tiles_plan import MEMORY_SHARE, free_memory
 
-AT_REST = 350e6  # bytes of a process with its modules, compiled code and GDAL's blocks
-READING = 450e6  # bytes while images are read: parts of 2^21 posts, of finer files 2^25 pixels
+AT_REST = 560e6  # bytes of a process that reads images: its parts, GDAL's blocks, what is judged
 PER_IMAGE = 100e3  # bytes: its cells and its share of the sums
 BYTES_PER_PIXEL = 60  # of all images in one block of rows
 BYTES_PER_POST = 160  # of the grid in one block of rows
 SAMPLE, VALUE = 24, 4  # bytes of a pixel that is kept between passes, or as it is
-READING_PER_POST = 100  # bytes, of scenes smaller than these parts
 DISK_PER_POST = 4 * 3.5 * 2  # bytes: four products, as scratch, and compressed
-READ_SECONDS, RAW_SECONDS = 0.1e-6, 1e-6  # per pixel, on two cores
-PASS_SECONDS, SAMPLE_SECONDS = 0.04e-6, 0.04e-6
+READ_SECONDS, RAW_SECONDS = 0.08e-6, 0.5e-6  # per pixel, on two cores
+PASS_SECONDS, SAMPLE_SECONDS = 0.03e-6, 0.035e-6
 WITH_CELLS, PASSES = 2 + WEIGHINGS, 30  # passes with cells; a guess where the number is not known
 HELD_BYTES = 2**26  # of images and terrain that are held; more is worth keeping for another run
 
@@ -89,7 +87,8 @@ class AlbedoPlan:
             f"posts    {self.shape[0]} x {self.shape[1]}\n"
             f"images   {self.images}, {self.pixels / 1e6:.4g} million pixels on these posts\n"
             f"passes   {passes}\n"
-            f"memory   {self.memory / 1e9:.2f} GB: {self.threads} threads; images {where}, samples "
+            f"memory   {self.memory / 1e9:.2f} GB: {self.threads} "
+            f"thread{'s' if self.threads > 1 else ''}; images {where}, samples "
             f"of {kept:.0f} % of their pixels are kept from pass to pass\n"
             f"disk     {self.disk / 1e9:.2f} GB at most while it runs\n"
             f"time     about {max(self.seconds / 60, 0.1):.1f} min on two cores"
@@ -128,16 +127,17 @@ def plan_albedo(placed, settings, memory=None):
     block = int(np.diff(above[edges]).max()), int(np.diff(edges).max()) * shape[1]
     per_thread = BYTES_PER_PIXEL * block[0] + BYTES_PER_POST * block[1]
     always = AT_REST + PER_IMAGE * images
-    least = always + max(per_thread, min(READING, READING_PER_POST * (pixels + block[1])))
+    least = always + per_thread
     given = free_memory() * MEMORY_SHARE if memory is None else memory
     if given < least:
+        name = "--memory" if memory is not None else f"{100 * MEMORY_SHARE:.0f} % of what is free,"
         raise InputError(
-            f"--memory {given / 1e9:.2f} GB is too little: {shape[0]} x {shape[1]} posts and "
+            f"{name} {given / 1e9:.2f} GB is too little: {shape[0]} x {shape[1]} posts and "
             f"{images} images need {ceil(least / 1e7) / 100:.2f} GB. Give that, a larger "
             "--spacing, narrower --bounds or fewer images."
         )
-    threads = int(min(get_num_threads(), max(1, (given - always) // per_thread)))
-    used = max(least, always + threads * per_thread)
+    threads = int(min(get_num_threads(), (given - always) // per_thread))
+    used = always + threads * per_thread
     values = VALUE * (pixels + shape[0] * shape[1])
     waits = values > min(HELD_BYTES, given - used)
     used += 0 if waits else values
