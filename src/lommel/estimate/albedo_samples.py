@@ -160,7 +160,7 @@ class SampleBlocks:
         self.shape = grid.shape
         self.masks, self.slope_noise = masks, slope_noise
         self.progress, self.passes = progress, 0
-        thresholds = shadow_thresholds(ThinImages(observations), masks)
+        thresholds = shadow_thresholds(ThinImages(observations, progress), masks)
         with ThreadPoolExecutor(get_num_threads()) as threads:
             seen = threads.map(self._look, observations, thresholds)
             looks = list(progress(seen, "levels", len(observations), get_num_threads()))
@@ -408,10 +408,12 @@ class ThinImages:
     Parameters
     ----------
     observations : list of Observation
+    progress : callable
     """
 
-    def __init__(self, observations):
+    def __init__(self, observations, progress):
         self.images = [observation.measured for observation in observations]
+        self.progress = progress
 
     def __len__(self):
         """Number of images."""
@@ -419,7 +421,7 @@ class ThinImages:
 
     def __iter__(self):
         """The pixels of one image after the other, read anew where they wait on a disk."""
-        for measured in self.images:
+        for measured in self.progress(self.images, "thresholds"):
             step = max(1, -(-measured.shape[0] * measured.shape[1] // THIN))
             rows = range(0, len(measured), step)
             yield measured[:] if step == 1 else np.concatenate([measured[row] for row in rows])

@@ -100,7 +100,7 @@ def run_albedo(
             settled, lost, remark = settle_cameras(
                 files, folder, registers, raw_cameras(files), progress
             )
-            placed = place_scene(settled, grid_settings)
+            placed = place_scene(settled, grid_settings, progress=progress)
             plan = plan_albedo(placed, settings, memory)
             kept = _kept(plan, record, output)
             scene = read_placed(placed, progress, kept.rows)

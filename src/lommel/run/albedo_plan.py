@@ -24,8 +24,8 @@ BYTES_PER_PIXEL = 60  # of all images in one block of rows
 BYTES_PER_POST = 160  # of the grid in one block of rows
 SAMPLE, VALUE = 24, 4  # bytes of a pixel that is kept between passes, or as it is
 DISK_PER_POST = 4 * 3.5 * 2  # bytes: four products, as scratch, and compressed
-READ_SECONDS, RAW_SECONDS = 0.08e-6, 0.5e-6  # per pixel, on two cores
-PASS_SECONDS, SAMPLE_SECONDS = 0.03e-6, 0.035e-6
+TERRAIN_SECONDS, READ_SECONDS, RAW_SECONDS = 0.13e-6, 0.06e-6, 0.9e-6  # per pixel, on one core
+PASS_SECONDS, SAMPLE_SECONDS = 0.03e-6, 0.035e-6  # per pixel, on two cores
 WITH_CELLS, PASSES = 2 + WEIGHINGS, 30  # passes with cells; a guess where the number is not known
 HELD_BYTES = 2**26  # of images and terrain that are held; more is worth keeping for another run
 
@@ -76,7 +76,9 @@ class AlbedoPlan:
         passes = self.passes or PASSES
         visits = PASS_SECONDS * passes * self.pixels
         samples = SAMPLE_SECONDS * (self.pixels + anew * (passes - 1))
-        return READ_SECONDS * flat + RAW_SECONDS * self.raw_pixels + visits + samples
+        reading = READ_SECONDS * flat + RAW_SECONDS * self.raw_pixels
+        terrain = TERRAIN_SECONDS * self.shape[0] * self.shape[1]
+        return terrain + reading + visits + samples
 
     def __str__(self):
         """Lines for people: posts, images, passes, memory, disk, time."""

@@ -108,10 +108,10 @@ def read_mixed_scene(files, grid_settings=None, body=MOON, progress=silent, stor
     scene : Scene
         The spacecraft of a line-scan image stands where it was at the middle line.
     """
-    return read_placed(place_scene(files, grid_settings, body), progress, store)
+    return read_placed(place_scene(files, grid_settings, body, progress), progress, store)
 
 
-def place_scene(files, grid_settings=None, body=MOON):
+def place_scene(files, grid_settings=None, body=MOON, progress=silent):
     """The grid and where the images lie on it.
 
     Parameters
@@ -119,6 +119,7 @@ def place_scene(files, grid_settings=None, body=MOON):
     files : SceneFiles
     grid_settings : GridSettings, optional
     body : Body
+    progress : callable
 
     Returns
     -------
@@ -136,7 +137,7 @@ def place_scene(files, grid_settings=None, body=MOON):
     if raw:
         pairs = replace(files, images=tuple(raw), cameras=tuple(raw.values()))
         images, skipped = read_raw_images(pairs, body)
-        views, more = _place_raw(images, terrain, settings)
+        views, more = _place_raw(images, terrain, settings, progress)
         skipped += more
         found = {image.path: (image, relief) for image, _, relief in views}
         own = {image.path: grid for image, grid, _ in views}
@@ -277,11 +278,11 @@ def _own_camera(path):
         return None  # reported when the image is read
 
 
-def _place_raw(images, terrain, settings):
+def _place_raw(images, terrain, settings, progress):
     """Image, grid of its part of the DEM and relief there; and the images that cannot be placed."""
     placed, skipped = [], []
     gsd = common_gsd(images, terrain)
-    for image in images:
+    for image in progress(images, "footprints"):
         try:
             if image.sun is None:
                 raise InputError(
