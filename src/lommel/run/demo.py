@@ -135,7 +135,10 @@ def _read_exposures(path):
 
 
 def _named(progress, stage):
-    return lambda items, name, **numbers: progress(items, f"{stage}: {name}", **numbers)
+    def named(items, name, total=None, at_once=1):
+        return progress(items, f"{stage}: {name}", total, at_once)
+
+    return named
 
 
 def _files(scene):
