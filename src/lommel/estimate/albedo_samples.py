@@ -18,7 +18,7 @@ from lommel.scene.masks import feathering, pixel_weights, shadow_thresholds
 
 ROWS_AT_ONCE = 256  # rows of geometry in memory, 200 bytes per post
 PIXELS_AT_ONCE = 2**21  # of all images in one block of rows, 24 bytes each
-POSTS_AT_ONCE = 2**21  # of the grid in one block of rows, 100 bytes each
+POSTS_AT_ONCE = 2**20  # of the grid in one block of rows, 100 bytes each
 KEPT_PIXELS = 2**26  # of all images whose samples are kept, 1.6 GB
 THIN = 2**22  # pixels that tell the level and the shadow threshold of an image
 STRIP = 32  # rows read together where not all are

@@ -20,8 +20,8 @@ from lommel.run.tiles_plan import MEMORY_SHARE, free_memory
 
 AT_REST = 560e6  # bytes of a process that reads images: its parts, GDAL's blocks, what is judged
 PER_IMAGE = 100e3  # bytes: its cells and its share of the sums
-BYTES_PER_PIXEL = 60  # of all images in one block of rows
-BYTES_PER_POST = 160  # of the grid in one block of rows
+BYTES_PER_PIXEL = 45  # of all images in one block of rows
+BYTES_PER_POST = 130  # of the grid in one block of rows
 SAMPLE, VALUE = 24, 4  # bytes of a pixel that is kept between passes, or as it is
 DISK_PER_POST = 4 * 3.5 * 2  # bytes: four products, as scratch, and compressed
 TERRAIN_SECONDS, READ_SECONDS, RAW_SECONDS = 0.13e-6, 0.06e-6, 0.9e-6  # per pixel, on one core
