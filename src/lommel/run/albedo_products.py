@@ -12,7 +12,7 @@ from lommel.estimate.albedo_maps import MapRows
 from lommel.io.raster import raster_writer
 from lommel.scene.grid import Window
 
-THIN_POSTS = 2**22  # of the map kept to judge its brightness as a whole
+THIN_POSTS = 2**20  # of the map kept to judge its brightness as a whole
 DETAIL_POSTS = 2**20  # of the part in the middle kept to look for shading
 
 
