@@ -117,6 +117,8 @@ class Photometry:
         The second is the noise scale that weighs the pixels of the maps.
     groups : list of list of int
         Of the images used.
+    reasons : list of str
+        Why an image was not used; empty where it was.
     passes : int
     history : list of dict
     outcome, advice : str
@@ -130,6 +132,7 @@ class Photometry:
     noise: float
     repetition: float
     groups: list[list[int]]
+    reasons: list[str]
     passes: int
     history: list[dict]
     outcome: str
@@ -176,9 +179,14 @@ def estimate_albedo(
     if not len(blocks.levels):
         listing = [f"  {o.name}: {r}" for o, r in zip(observations, blocks.reasons, strict=True)]
         raise InputError("No image can be used.\n" + "\n".join(listing[:20]))
-    problem = _pose(blocks, settings)
     remember = remember or (lambda compute: compute())
-    return _map(problem, remember(lambda: _fit(problem)), take)
+    found = remember(lambda: _fit(blocks, settings))
+    if found.reasons != blocks.reasons:  # known from an earlier run
+        used = [
+            reason for reason, own in zip(found.reasons, blocks.reasons, strict=True) if not own
+        ]
+        blocks.keep(np.array([not reason for reason in used]), used)
+    return _map(_pose(blocks, settings), found, take)
 
 
 def _pose(blocks, settings):
@@ -194,10 +202,10 @@ def _pose(blocks, settings):
     return Problem(blocks, overlapping_pairs(blocks.windows), settings, is_fitted, start)
 
 
-def _fit(problem):
-    """Photometry of a problem on all posts."""
-    blocks, settings = problem.blocks, problem.settings
+def _fit(blocks, settings):
+    """Photometry; images that tell none are left out of the blocks."""
     cells = cells_of(blocks) if settings.solver == "projection" else blocks
+    problem = _pose(blocks, settings)
     solved, solution = solve(_pose(cells, settings))
     point = solution.value
     weighted_with = point.scale
@@ -219,6 +227,7 @@ def _fit(problem):
         noise=noise_scale(point.sums.histogram),
         repetition=point.repetition,
         groups=[group.tolist() for group in groups],
+        reasons=list(blocks.reasons),
         passes=blocks.passes,
         history=solution.history,
         outcome=solution.outcome,

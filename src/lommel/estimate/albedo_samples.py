@@ -188,7 +188,7 @@ class SampleBlocks:
             setattr(self, name, getattr(self, name)[is_kept])
         self.frames = [frame for frame, kept in zip(self.frames, is_kept, strict=True) if kept]
         self.pixels = int(np.sum(self.windows[:, 2] * self.windows[:, 3]))
-        self._kept = None if self._kept is None else {}
+        self._kept = {}
 
     def span(self, block):
         """First row of a block, and the row behind its last one."""
