@@ -3,15 +3,17 @@
 import json
 import signal
 import sys
+from io import StringIO
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from affine import Affine
 from pyproj import CRS
+from rich.console import Console
 
 from lommel import __version__
-from lommel.cli import main
+from lommel.cli import _progress, _Times, main
 from lommel.errors import ConvergenceError
 from lommel.io.raster import write_raster
 from lommel.scene.body import MOON, to_xyz
@@ -222,6 +224,42 @@ def test_info_that_cannot_be_given_is_an_error(raw, lommel, words, message):
     ended = lommel("info", *words)
     assert (ended.status, ended.out) == (2, "")
     assert message in ended.err
+
+
+# --- Progress and plans ---------------------------------------------------------------------------
+
+
+def test_log_that_is_no_terminal_gets_lines(scene, lommel, monkeypatch):
+    monkeypatch.setattr("lommel.progress.WORTH_TELLING", 0.0)
+    log = lommel("albedo", *REQUEST).err.splitlines()
+    assert [line for line in log if line.startswith("images 2 of 2, ")]
+    assert [line for line in log if line.startswith("maps, block ")]
+    assert not any("\x1b" in line for line in log)
+
+
+def test_terminal_gets_bars_with_time_left(monkeypatch):
+    screen = StringIO()
+    terminal = Console(file=screen, force_terminal=True, width=100)
+    monkeypatch.setattr("lommel.cli.log", terminal)
+    monkeypatch.setattr("lommel.cli.WORTH_TELLING", 0.0)
+    with _progress() as progress:
+        for number in progress(range(4), "tiles"):
+            assert number < 4
+    assert "tiles" in screen.getvalue() and "4/4" in screen.getvalue()
+    midway = {"completed": 1, "total": 4, "elapsed": 12.0, "finished": False}
+    task = SimpleNamespace(**midway, fields={"last": 10.0, "at_once": 1})
+    assert str(_Times().render(task)) == "12 s, 28 s left"
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_dry_run_tells_memory_disk_and_time_and_writes_nothing(scene, lommel, stage):
+    before = listing(scene)
+    ended = lommel(stage, *REQUEST, "--dry-run", "--memory", "2GB")
+    assert ended.status == 0, ended.err
+    assert {"posts", "memory", "disk", "time"} <= {
+        line.split()[0] for line in ended.out.splitlines()
+    }
+    assert listing(scene) == before
 
 
 # --- Wrong words ----------------------------------------------------------------------------------

@@ -10,17 +10,21 @@ import json
 import math
 import signal
 import sys
+import time
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn
+from rich.text import Text
 
 from lommel import __version__
 from lommel.errors import InputError, LommelError
+from lommel.progress import WORTH_TELLING, Lines, count_of, seconds_left, spoken
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -124,10 +128,23 @@ def albedo(
     spacing: Spacing = None,
     crs: Crs = None,
     bounds: Bounds = None,
+    memory: Annotated[
+        str | None,
+        typer.Option(
+            help="What the run may take, like 8GB; the products are the same. "
+            "Default: 60 % of what is free."
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show passes, memory, disk and time; solve nothing.")
+    ] = False,
     overwrite: Overwrite = False,
 ):
     """Albedo map and exposures from overlapping images, projected or with cameras, and a DEM."""
     from lommel.run.albedo import albedo_settings, run_albedo
+    from lommel.run.albedo_plan import plan_albedo
+    from lommel.run.mixed_scene import place_scene
+    from lommel.run.tiles_plan import read_memory
 
     settings = albedo_settings(
         solver=solver,
@@ -140,10 +157,13 @@ def albedo(
         shadow_threshold=shadow_threshold,
     )
     files = _files(images, dem, sun_positions, spacecraft_positions, positions_unit, cameras)
-    with _progress("Reading images") as progress:
-        run_albedo(
-            files, output, settings, _grid(spacing, crs, bounds), overwrite, progress, registers
-        )
+    grid = _grid(spacing, crs, bounds)
+    size = None if memory is None else read_memory(memory)
+    if dry_run:
+        typer.echo(plan_albedo(place_scene(files, grid), settings, size))
+        return
+    with _progress() as progress:
+        run_albedo(files, output, settings, grid, overwrite, progress, registers, size)
     _finish(output)
 
 
@@ -274,7 +294,7 @@ def sfs(
     if tiles is not None:
         _solve_share(tiles, files, output, settings, grid, tiling)
         return
-    with _progress("Images, tiles") as progress:
+    with _progress() as progress:
         run_shape_from_shading(files, output, settings, grid, overwrite, progress, tiling)
     _finish(output, report)
 
@@ -283,7 +303,7 @@ def _solve_share(text, *request):
     from lommel.run.tiles_array import prepare_array, read_share, solve_share
 
     share = read_share(text)
-    with _progress("Images, tiles") as progress:
+    with _progress() as progress:
         if share.number == 0:
             count = prepare_array(*request, progress)
             done = f"The scene is prepared: {count} tiles for {share.count} jobs."
@@ -301,7 +321,8 @@ def merge(
     """Write the products of a job array when all of its shares are solved."""
     from lommel.run.tiles_array import merge_tiles
 
-    merge_tiles(output, overwrite)
+    with _progress() as progress:
+        merge_tiles(output, overwrite, progress)
     _finish(output, draws_report=False)
 
 
@@ -322,7 +343,7 @@ def orthoproject(
     from lommel.run.orthoproject import run_orthoproject
 
     files = _files(images, dem, sun_positions, None, positions_unit, cameras)
-    with _progress("Projecting") as progress:
+    with _progress() as progress:
         run_orthoproject(files, output, _grid(spacing, crs, bounds), overwrite, progress)
     _finish(output, draws_report=None)
 
@@ -350,7 +371,7 @@ def register(
 
     settings = RegistrationSettings(search_radius, adjust, reflectance)
     files = _files(images, dem, sun_positions, None, positions_unit, cameras)
-    with _progress("Registering") as progress:
+    with _progress() as progress:
         run_register(files, output, settings, overwrite, progress)
     _finish(output, draws_report=None)
 
@@ -364,7 +385,7 @@ def simulate(
     """Make a scene with a known answer: truth, initial DEM, orthoimages, position tables."""
     from lommel.run.simulate import run_simulate
 
-    with _progress("Taking images") as progress:
+    with _progress() as progress:
         run_simulate(scene, output, overwrite, progress)
     typer.echo(output)
 
@@ -377,7 +398,7 @@ def demo(
     """Simulate an orbit strip and run everything on it: the errors are known."""
     from lommel.run.demo import run_demo
 
-    with _progress("Demo") as progress:
+    with _progress() as progress:
         run_demo(output, overwrite, progress)
     _finish(output)
 
@@ -507,16 +528,39 @@ def _grid(spacing, crs, bounds):
 
 
 @contextmanager
-def _progress(title):
-    """A function that wraps an iterable in a progress bar on stderr."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=log, transient=False) as bar:
-        yield lambda items, description=title: bar.track(items, description=description)
+def _progress():
+    """A function (items, name) that shows how far a step is: bars on a terminal, lines in a log."""
+    if not log.is_terminal:
+        yield Lines(lambda line: log.print(line, soft_wrap=True))
+        return
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Times()
+    with Progress(*columns, console=log) as bars:
+        yield partial(_bar, bars)
+
+
+def _bar(bars, items, name, total=None, at_once=1):
+    start = time.monotonic()
+    task = bars.add_task(name, total=count_of(items, total), at_once=at_once, last=0.0)
+    for item in items:
+        yield item
+        bars.update(task, advance=1, last=time.monotonic() - start)
+    if time.monotonic() - start < WORTH_TELLING:
+        bars.remove_task(task)
+
+
+class _Times(ProgressColumn):
+    """Time so far, and time left by the parts that are done."""
+
+    def render(self, task):
+        elapsed = task.finished_time if task.finished else task.elapsed
+        so_far = spoken(elapsed or 0.0)
+        if task.finished or not task.completed or task.total is None:
+            return Text(so_far)
+        last = task.fields["last"]
+        left = (
+            last - elapsed + seconds_left(task.completed, task.total, last, task.fields["at_once"])
+        )
+        return Text(f"{so_far}, {spoken(max(left, 0.0))} left")
 
 
 def _finish(output, draws_report=True):

@@ -108,3 +108,20 @@ def test_images_full_of_holes_are_taken_as_they_are(monkeypatch):
     blocks = blocks_of(scene)
     assert cells_of(blocks) is blocks
     assert not any(blocks.reasons)
+
+
+def test_image_left_out_stays_out_when_the_photometry_is_remembered(monkeypatch):
+    monkeypatch.setattr(albedo_cells, "ACROSS", 8)
+    scene, kept = strip(noise=0.02), []
+    scene.observations[4].measured[::4, ::4] = np.nan
+    given = scene.observations, scene.grid, scene.heights
+
+    def remember(compute):
+        kept[:] = kept or [compute()]
+        return kept[0]
+
+    fresh, again = (estimate_albedo(*given, remember=remember) for _ in range(2))
+    assert [k for k, reason in enumerate(again.reasons) if reason] == [4]
+    for name in ("albedo", "albedo_error", "count", "exposures"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(fresh, name))
+    assert (again.groups, again.passes) == (fresh.groups, fresh.passes)

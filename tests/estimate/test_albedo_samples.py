@@ -9,7 +9,12 @@ from lommel.estimate import albedo_samples
 from lommel.estimate.albedo import estimate_albedo
 from lommel.estimate.albedo_light import TerrainPart
 from lommel.estimate.albedo_maps import WholeMaps
-from lommel.estimate.albedo_samples import SampleBlocks, clipped, image_geometry
+from lommel.estimate.albedo_samples import (
+    SampleBlocks,
+    block_edges,
+    clipped,
+    image_geometry,
+)
 from lommel.scene.grid import Window, grid_from_bounds, read_crs
 from lommel.scene.masks import MaskSettings
 
@@ -60,18 +65,33 @@ def test_rows_hold_what_the_whole_holds():
             )
 
 
-def test_samples_computed_anew_give_the_same_answer(monkeypatch):
+@pytest.mark.parametrize("kept_pixels", [0, 5000])
+def test_samples_computed_anew_give_the_same_answer(kept_pixels):
     scene = strip(noise=0.02)
-    kept = estimate_albedo(scene.observations, scene.grid, scene.heights)
-    blocks = {"kept_pixels": 0}
-    monkeypatch.setattr(
-        solver, "SampleBlocks", lambda *args: albedo_samples.SampleBlocks(*args, **blocks)
-    )
-    anew = estimate_albedo(scene.observations, scene.grid, scene.heights)
+    given = scene.observations, scene.grid, scene.heights
+    kept, anew = estimate_albedo(*given), estimate_albedo(*given, kept_pixels=kept_pixels)
     np.testing.assert_array_equal(anew.exposures, kept.exposures)
     np.testing.assert_array_equal(anew.albedo, kept.albedo)
     np.testing.assert_array_equal(anew.albedo_error, kept.albedo_error)
     assert anew.disagreement == kept.disagreement
+
+
+def test_samples_are_kept_as_far_as_they_fit():
+    blocks = blocks_of(strip(), kept_pixels=5000)
+    sizes = [len(blocks.block(block).measured) for block in range(blocks.count)]
+    kept = [blocks.block(block) is blocks.block(block) for block in range(blocks.count)]
+    assert 0 < sum(kept) < blocks.count
+    assert 5000 - max(sizes) < np.dot(sizes, kept) <= 5000
+    assert sum(sizes) == blocks.pixels
+
+
+def test_blocks_cover_all_rows_and_are_small_where_many_images_are():
+    windows = np.array([[0, 0, 4000, 100], *[[1000, 0, 200, 20000]] * 50])
+    edges, above = block_edges(windows, (4000, 20000))
+    assert (edges[0], edges[-1]) == (0, 4000) and above[-1] == 4000 * 100 + 50 * 200 * 20000
+    heights = np.diff(edges)
+    assert heights.min() >= 1 and heights.max() * 20000 <= albedo_samples.POSTS_AT_ONCE
+    assert np.diff(above[edges]).max() <= albedo_samples.PIXELS_AT_ONCE
 
 
 def test_more_blocks_change_rounding_only(monkeypatch):

@@ -24,9 +24,9 @@ def demo(tmp_path_factory):
     strip.write_text(STRIP, encoding="utf-8")
     named = []
 
-    def progress(iterable, description):
-        named.append(description)
-        return iterable
+    def progress(items, name, total=None, at_once=1):
+        named.append(name.split(":")[0])
+        return items
 
     results = run_demo(folder / "out", progress=progress, strip=strip)
     return folder / "out", results, named

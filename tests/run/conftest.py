@@ -1,4 +1,4 @@
-"""A scene cut into tiles, shared by the tests of tiles, engines and job arrays."""
+"""Scenes shared by tests: one cut into tiles, and a strip for the albedo stage."""
 
 import shutil
 
@@ -6,10 +6,19 @@ import pytest
 from benchmarks.scenes import Scene, make_scene
 
 from lommel.run.shape_from_shading import SfsSettings, run_shape_from_shading
+from lommel.run.simulate import run_simulate
 from lommel.run.tiles_array import Share, prepare_array, solve_share
 from lommel.run.tiles_plan import Tiling, work_folder
 
+from .albedo_scene import SMALL
 from .tiled_scene import POSTS, SIDE, files_of
+
+
+@pytest.fixture(scope="session")
+def ground(tmp_path_factory):
+    path = tmp_path_factory.mktemp("strip") / "small.toml"
+    path.write_text(SMALL, encoding="utf-8")
+    return run_simulate(path, path.parent / "out")
 
 
 @pytest.fixture(scope="session")

@@ -6,43 +6,12 @@ import numpy as np
 import pytest
 
 from lommel.errors import InputError
-from lommel.estimate import albedo_samples
-from lommel.estimate.albedo_settings import AlbedoSettings
 from lommel.io.raster import read_grid, read_pixels, write_raster
-from lommel.run import stored_rows
 from lommel.run.albedo import albedo_settings, run_albedo
 from lommel.run.demo import exposure_errors
 from lommel.run.inputs import SceneFiles
-from lommel.run.simulate import run_simulate
 
-SMALL = """
-seed = 7
-[grid]
-rows = 24
-cols = 64
-spacing = 8000.0
-"""
-
-
-def own_photometry():
-    """The simulated ground scatters as its model says."""
-    return AlbedoSettings(phase_factor=None, fit_phase_factor=False, fit_falloff=False)
-
-
-@pytest.fixture(scope="module")
-def ground(tmp_path_factory):
-    path = tmp_path_factory.mktemp("scene") / "small.toml"
-    path.write_text(SMALL, encoding="utf-8")
-    return run_simulate(path, path.parent / "out")
-
-
-def files_of(ground, images=None):
-    return SceneFiles(
-        tuple(images or ground.images),
-        (ground.initial_dem,),
-        ground.sun_positions,
-        ground.spacecraft_positions,
-    )
+from .albedo_scene import files_of, own_photometry
 
 
 @pytest.fixture(scope="module")
@@ -69,16 +38,6 @@ def test_folder_holds_the_products_of_the_stage(product):
     }
     grids = [read_grid(path) for path in output.glob("*.tif")]
     assert all(grid.is_same(grids[0]) for grid in grids)
-
-
-def test_images_on_the_disk_give_the_same_products(product, ground, tmp_path, monkeypatch):
-    output, results = product
-    monkeypatch.setattr(stored_rows, "HELD_BYTES", 0)
-    monkeypatch.setattr(albedo_samples, "KEPT_PIXELS", 0)
-    assert run_albedo(files_of(ground), tmp_path / "out", own_photometry()) == results
-    for name in ("albedo", "orthomosaic", "count", "residual"):
-        here, there = (read_pixels(path / f"{name}.tif") for path in (tmp_path / "out", output))
-        np.testing.assert_array_equal(here, there)
 
 
 def test_exposures_are_those_of_the_scene(product, ground):

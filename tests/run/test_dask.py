@@ -27,9 +27,9 @@ def test_the_tile_of_a_worker_that_is_killed_goes_to_another(half_done, tile_sce
         n_workers=2, threads_per_worker=2, memory_limit=0, dashboard_address=None
     ) as cluster:
 
-        def progress(items):
+        def progress(items, name, total=None, at_once=1):
             for done, item in enumerate(items):
-                if done == 2 and not killed:
+                if name == "tiles" and done == 2 and not killed:
                     killed.append(cluster.workers[0].pid)
                     os.kill(killed[0], signal.SIGKILL)
                 yield item

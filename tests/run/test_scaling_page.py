@@ -12,7 +12,7 @@ from lommel.cli import app
 from lommel.run.tiles_array import read_share
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "scaling.md").read_text(encoding="utf-8")
-COMMANDS = sorted(set(re.findall(r"\blommel (?:sfs|merge) [^`|#\n]*", PAGE)))
+COMMANDS = sorted(set(re.findall(r"\blommel (?:albedo|sfs|merge) [^`|#\n]*", PAGE)))
 
 
 def blocks(language):

@@ -22,13 +22,13 @@ mean albedo that image k alone sees, about its mean over the images.
 `estimate_albedo`.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from lommel.core.reflectance import reflectance_model
 from lommel.errors import InputError
-from lommel.estimate.albedo_arrays import OWN, SHARED
+from lommel.estimate.albedo_arrays import OWN, SHARED, State
 from lommel.estimate.albedo_cells import cells_of
 from lommel.estimate.albedo_equations import (
     Problem,
@@ -41,6 +41,7 @@ from lommel.estimate.albedo_maps import LastPass, MapRows, WholeMaps
 from lommel.estimate.albedo_samples import SampleBlocks, overlapping_pairs
 from lommel.estimate.albedo_settings import AlbedoSettings, check_settings
 from lommel.estimate.albedo_solver import solve, weighting
+from lommel.progress import silent
 
 WEIGHINGS = 2  # passes over all posts that tell the noise scale, once exposures come from cells
 
@@ -102,7 +103,52 @@ class AlbedoResult:
     advice: str
 
 
-def estimate_albedo(observations, grid, heights, settings=None, progress=None, take=None):
+@dataclass(frozen=True, eq=False)
+class Photometry:
+    """What the images tell but for the maps, which one more pass then makes.
+
+    Attributes
+    ----------
+    state : State
+    errors : float64 array (images, 2)
+        Of log exposure, and of haze in units of the image's level.
+    shared_errors : float64 array (4,); NaN where not fitted
+    mean_log_albedo, weighted_with, noise, repetition : float
+        The second is the noise scale that weighs the pixels of the maps.
+    groups : list of list of int
+        Of the images used.
+    reasons : list of str
+        Why an image was not used; empty where it was.
+    passes : int
+    history : list of dict
+    outcome, advice : str
+    """
+
+    state: State
+    errors: np.ndarray
+    shared_errors: np.ndarray
+    mean_log_albedo: float
+    weighted_with: float
+    noise: float
+    repetition: float
+    groups: list[list[int]]
+    reasons: list[str]
+    passes: int
+    history: list[dict]
+    outcome: str
+    advice: str
+
+
+def estimate_albedo(
+    observations,
+    grid,
+    heights,
+    settings=None,
+    progress=silent,
+    take=None,
+    kept_pixels=None,
+    remember=None,
+):
     """Albedo, exposures and haze from images on one grid.
 
     Parameters
@@ -111,11 +157,15 @@ def estimate_albedo(observations, grid, heights, settings=None, progress=None, t
     grid : Grid
     heights : array (rows, cols), m
     settings : AlbedoSettings, optional
-    progress : callable, optional
-        Called with (pass, objective) after each pass over the images.
+    progress : callable
+        Shows how far each pass over the images is.
     take : function (first row, MapRows), optional
         Takes the maps some rows at a time, from several threads in any order; else the result
         holds them whole.
+    kept_pixels : int, optional
+        As `SampleBlocks` takes it.
+    remember : function (compute), optional
+        Gives the `Photometry` that ``compute()`` gives, perhaps from a run that was broken off.
 
     Returns
     -------
@@ -124,13 +174,19 @@ def estimate_albedo(observations, grid, heights, settings=None, progress=None, t
     settings = settings or AlbedoSettings()
     check_settings(settings)
     model = reflectance_model(settings.reflectance)
-    blocks = SampleBlocks(observations, grid, heights, model, settings.masks, settings.slope_noise)
+    terms = model, settings.masks, settings.slope_noise, kept_pixels, progress
+    blocks = SampleBlocks(observations, grid, heights, *terms)
     if not len(blocks.levels):
         listing = [f"  {o.name}: {r}" for o, r in zip(observations, blocks.reasons, strict=True)]
         raise InputError("No image can be used.\n" + "\n".join(listing[:20]))
-    cells = cells_of(blocks) if settings.solver == "projection" else blocks
-    problem, solution = solve(_pose(cells, settings), progress or (lambda *_: None))
-    return _result(problem, solution, replace(problem, blocks=blocks), take)
+    remember = remember or (lambda compute: compute())
+    found = remember(lambda: _fit(blocks, settings))
+    if found.reasons != blocks.reasons:  # known from an earlier run
+        used = [
+            reason for reason, own in zip(found.reasons, blocks.reasons, strict=True) if not own
+        ]
+        blocks.keep(np.array([not reason for reason in used]), used)
+    return _map(_pose(blocks, settings), found, take)
 
 
 def _pose(blocks, settings):
@@ -146,60 +202,73 @@ def _pose(blocks, settings):
     return Problem(blocks, overlapping_pairs(blocks.windows), settings, is_fitted, start)
 
 
-def _result(solved, solution, problem, take):
-    """Bring the gauge to mean exposure 1, and collect; the last pass leaves the maps.
-
-    ``solved`` is the problem on the cells that the solution belongs to, ``problem`` the same on all
-    posts.
-    """
-    point, reasons = solution.value, problem.blocks.reasons
-    used = np.array([not reason for reason in reasons])
-    state = point.state
-    gauge = state.exposure.mean()
-    steps = solution.history[-1]["step"] if solution.history else problem.settings.max_steps
-    passes = steps + 1 if solved.blocks is problem.blocks else 1 + WEIGHINGS
+def _fit(blocks, settings):
+    """Photometry; images that tell none are left out of the blocks."""
+    cells = cells_of(blocks) if settings.solver == "projection" else blocks
+    problem = _pose(blocks, settings)
+    solved, solution = solve(_pose(cells, settings))
+    point = solution.value
     weighted_with = point.scale
     point.scale, point.repetition = weighting(point)
     errors = standard_errors(solved, point)
-    if solved.blocks is not problem.blocks:
+    if cells is not blocks:
         for _ in range(WEIGHINGS):
             weighted_with = point.scale
-            point = visit(problem, state, point.mean_log_albedo, weighted_with, 1.0)
+            point = visit(problem, point.state, point.mean_log_albedo, weighted_with, 1.0)
             point.scale, point.repetition = weighting(point)
-    own = errors[: OWN * problem.images].reshape(-1, OWN)
-    noise = noise_scale(point.sums.histogram)
+    groups = connected_groups(solved, solution.value)
+    shared = slice(-SHARED - 1, -1)
+    return Photometry(
+        state=point.state,
+        errors=errors[: OWN * problem.images].reshape(-1, OWN),
+        shared_errors=np.where(problem.is_fitted[shared], errors[shared], np.nan),
+        mean_log_albedo=float(point.mean_log_albedo),
+        weighted_with=weighted_with,
+        noise=noise_scale(point.sums.histogram),
+        repetition=point.repetition,
+        groups=[group.tolist() for group in groups],
+        reasons=list(blocks.reasons),
+        passes=blocks.passes,
+        history=solution.history,
+        outcome=solution.outcome,
+        advice=solution.advice + _remarks(problem, groups),
+    )
+
+
+def _map(problem, found, take):
+    """Bring the gauge to mean exposure 1, and collect; the last pass leaves the maps."""
+    blocks, state, reasons = problem.blocks, found.state, problem.blocks.reasons
+    used = np.array([not reason for reason in reasons])
+    gauge = state.exposure.mean()
 
     def per_image(values):
         everyone = np.full(len(reasons), np.nan)
         everyone[used] = values
         return everyone
 
-    whole = WholeMaps(problem.blocks.shape) if take is None else None
-    last_pass = LastPass(state, noise, problem.blocks.pixels, take or whole)
-    visit(problem, state, point.mean_log_albedo, weighted_with, 1.0, last_pass)
+    whole = WholeMaps(blocks.shape) if take is None else None
+    last_pass = LastPass(state, found.noise, blocks.pixels, take or whole)
+    visit(problem, state, found.mean_log_albedo, found.weighted_with, 1.0, last_pass)
     before, after = last_pass.disagreements()
-    groups = connected_groups(solved, solution.value)
     indices = np.flatnonzero(used)
     return AlbedoResult(
         **(dict.fromkeys(MapRows.__annotations__) if whole is None else vars(whole.rows)),
         exposures=per_image(state.exposure / gauge),
-        exposure_errors=per_image(state.exposure / gauge * own[:, 0]),
+        exposure_errors=per_image(state.exposure / gauge * found.errors[:, 0]),
         hazes=per_image(state.haze),
-        haze_errors=per_image(state.level * own[:, 1]),
+        haze_errors=per_image(state.level * found.errors[:, 1]),
         reasons=tuple(reasons),
         shared=state.shared,
-        shared_errors=np.where(
-            problem.is_fitted[-SHARED - 1 : -1], errors[-SHARED - 1 : -1], np.nan
-        ),
-        groups=tuple(tuple(indices[group].tolist()) for group in groups),
+        shared_errors=found.shared_errors,
+        groups=tuple(tuple(indices[group].tolist()) for group in found.groups),
         disagreement_before=before,
         disagreement=after,
-        noise=noise,
-        repetition=point.repetition,
-        passes=passes + 1,
-        history=solution.history,
-        outcome=solution.outcome,
-        advice=solution.advice + _remarks(problem, groups),
+        noise=found.noise,
+        repetition=found.repetition,
+        passes=found.passes + 1,
+        history=found.history,
+        outcome=found.outcome,
+        advice=found.advice,
     )
 
 

@@ -60,30 +60,30 @@ class Pairs(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """What one pass leaves; the first axis counts blocks of rows.
+    """What one pass leaves.
 
     Attributes
     ----------
-    own : array (blocks, images, 2, 2)
+    own : array (images, 2, 2)
         w J^T J of each image's parameters, upper triangle, before elimination.
-    pairs : array (blocks, pairs, 2, 2)
+    pairs : array (pairs, 2, 2)
         What the elimination of the albedo subtracts.
-    shared_pixels : array (blocks, pairs)
+    shared_pixels : array (pairs,)
         Pixels that both images of a pair see.
-    border : array (blocks, images, 2, 4)
+    border : array (images, 2, 4)
         Image parameters against shared ones, eliminated.
-    square : array (blocks, 4, 4)
+    square : array (4, 4)
         Shared parameters, upper triangle, eliminated.
-    gradient : array (blocks, images, 2)
-    shared_gradient : array (blocks, 4)
-    means : array (blocks, images, 7)
+    gradient : array (images, 2)
+    shared_gradient : array (4,)
+    means : array (images, 7)
         Sums of weight, weight I, weight M and of weight times the derivatives of M.
-    patches : array (blocks, images, 8, 8)
+    patches : array (images, 8, 8)
         Sum of the scores (derivative of the loss) in each patch of each image.
-    score_square : array (blocks, 1)
-    histogram : array (blocks, SCALE_BINS)
+    score_square : array (1,)
+    histogram : array (SCALE_BINS,)
         Sizes of residuals times the root of their precision.
-    cost : array (blocks, 1)
+    cost : array (1,)
     """
 
     own: np.ndarray
@@ -159,21 +159,21 @@ class Work(NamedTuple):
     residual: np.ndarray
 
 
-def empty_sums(images, pairs, blocks=BLOCKS):
+def empty_sums(images, pairs):
     """Sums of nothing."""
     return Sums(
-        own=np.zeros((blocks, images, OWN, OWN)),
-        pairs=np.zeros((blocks, pairs, OWN, OWN)),
-        shared_pixels=np.zeros((blocks, pairs)),
-        border=np.zeros((blocks, images, OWN, SHARED)),
-        square=np.zeros((blocks, SHARED, SHARED)),
-        gradient=np.zeros((blocks, images, OWN)),
-        shared_gradient=np.zeros((blocks, SHARED)),
-        means=np.zeros((blocks, images, 3 + SHARED)),
-        patches=np.zeros((blocks, images, PATCHES, PATCHES)),
-        score_square=np.zeros((blocks, 1)),
-        histogram=np.zeros((blocks, SCALE_BINS)),
-        cost=np.zeros((blocks, 1)),
+        own=np.zeros((images, OWN, OWN)),
+        pairs=np.zeros((pairs, OWN, OWN)),
+        shared_pixels=np.zeros(pairs),
+        border=np.zeros((images, OWN, SHARED)),
+        square=np.zeros((SHARED, SHARED)),
+        gradient=np.zeros((images, OWN)),
+        shared_gradient=np.zeros(SHARED),
+        means=np.zeros((images, 3 + SHARED)),
+        patches=np.zeros((images, PATCHES, PATCHES)),
+        score_square=np.zeros(1),
+        histogram=np.zeros(SCALE_BINS),
+        cost=np.zeros(1),
     )
 
 

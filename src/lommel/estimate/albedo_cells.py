@@ -46,8 +46,7 @@ def cells_of(blocks):
     -------
     blocks : Cells or SampleBlocks
     """
-    areas = blocks.windows[:, 2] * blocks.windows[:, 3]
-    size = int(np.sqrt(np.median(areas)) / ACROSS)
+    size = cell_size(blocks.windows)
     if size < 2:
         return blocks
     cells = Cells(blocks, size)
@@ -58,6 +57,16 @@ def cells_of(blocks):
         blocks.keep(is_told, [TOO_FEW.format(100 * share, size, size) for share in cells.whole])
         cells.keep(is_told)
     return cells
+
+
+def cell_size(windows):
+    """Posts along a cell; 1 or less where images are too small for cells.
+
+    Parameters
+    ----------
+    windows : int64 array (images, 4)
+    """
+    return int(np.sqrt(np.median(windows[:, 2] * windows[:, 3])) / ACROSS)
 
 
 class Cells:
@@ -83,12 +92,10 @@ class Cells:
         self.windows = np.concatenate([first, last - first], axis=1)
         self.count = min(BLOCKS, self.shape[0])
         sums = [np.zeros((7, *window[2:])) for window in self.windows]
-        with ThreadPoolExecutor(get_num_threads()) as threads:
-            parts = threads.map(lambda block: _sums(blocks, block, size), range(blocks.count))
-            for part in parts:  # in order, so that sums do not depend on the threads
-                for k, row, values in part:
-                    top = row - self.windows[k, 0]
-                    sums[k][:, top : top + values.shape[1]] += values
+        for part in blocks.each(lambda block: _sums(blocks, block, size)):
+            for k, row, values in part:
+                top = row - self.windows[k, 0]
+                sums[k][:, top : top + values.shape[1]] += values
         self.images = [_means(image, size**2) for image in sums]
         self.whole = np.array([np.mean(image[4] > 0) for image in self.images])
         self.completeness = self.whole / max(self.whole.max(), 1e-300)
@@ -98,6 +105,11 @@ class Cells:
         for name in ("levels", "brightness", "windows", "whole", "completeness"):
             setattr(self, name, getattr(self, name)[is_kept])
         self.images = [image for image, kept in zip(self.images, is_kept, strict=True) if kept]
+
+    def each(self, visit, name=None):
+        """As `SampleBlocks.each`, of which it is too quick to be told."""
+        with ThreadPoolExecutor(get_num_threads()) as threads:
+            yield from threads.map(visit, range(self.count))
 
     def span(self, block):
         """First row of a block, and the row behind its last one."""

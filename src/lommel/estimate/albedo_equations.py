@@ -21,7 +21,6 @@ from lommel.estimate.albedo_arrays import (
     Pairs,
     State,
     Sums,
-    empty_sums,
 )
 from lommel.estimate.albedo_kernels import accumulate
 from lommel.estimate.albedo_rows import LOSSES
@@ -80,7 +79,7 @@ class Point:
     mean_log_albedo : float
     scale, repetition : float
         What the pass was weighted with.
-    sums : Sums, blocks added up
+    sums : Sums
     objective : float
     """
 
@@ -94,10 +93,8 @@ class Point:
 
 def visit(problem, state, mean_log_albedo, scale, repetition, keep=None):
     """One pass over the images: the sums and objective at these parameters; see `accumulate`."""
-    blocks = empty_sums(problem.images, len(problem.pairs.second), problem.blocks.count)
     loss = LOSSES[problem.settings.loss]
-    accumulate(problem.blocks, problem.pairs, state, scale, loss, blocks, keep)
-    sums = Sums(*(part.sum(axis=0) for part in blocks))
+    sums = accumulate(problem.blocks, problem.pairs, state, scale, loss, keep)
     point = Point(state, mean_log_albedo, scale, repetition, sums, 0.0)
     point.objective = float(sums.cost[0]) / repetition
     if problem.settings.solver == "projection":

@@ -14,12 +14,10 @@ of the image's level) and by the shared ones (c1, c2, v2, v4). Loops run along r
 sums are kept per block of rows, so that results do not depend on the number of threads.
 """
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
-from numba import get_num_threads, njit
+from numba import njit
 
-from lommel.estimate.albedo_arrays import OWN, PATCHES, SHARED, Sums, Work, empty_maps
+from lommel.estimate.albedo_arrays import OWN, PATCHES, SHARED, Work, empty_maps, empty_sums
 from lommel.estimate.albedo_rows import (
     LEAST_SQUARES,
     brightness_row,
@@ -252,7 +250,7 @@ def _visit_rows(first_row, last_row, samples, pairs, state, scale, loss, maps, s
         _eliminate(samples, images, pairs, place_of, work, sums)
 
 
-def accumulate(blocks, pairs, state, scale, loss, sums, keep=None):
+def accumulate(blocks, pairs, state, scale, loss, keep=None):
     """Visit every pixel once: best albedo, then the sums of a Gauss-Newton step.
 
     Parameters
@@ -265,22 +263,30 @@ def accumulate(blocks, pairs, state, scale, loss, sums, keep=None):
         Standard error of a residual times the root of its precision.
     loss : int
         LEAST_SQUARES, HUBER or CAUCHY.
-    sums : Sums
-        Zeros from `empty_sums`; added to.
     keep : function (first, last, samples, maps), optional
         Called for each block of rows from first to before last with its samples and `Maps`, from
         several threads in any order.
+
+    Returns
+    -------
+    sums : Sums
+        Of the blocks in their order, so that they do not depend on the threads.
     """
+    images = len(blocks.windows)
 
     def visit_block(block):
         first, last = blocks.span(block)
+        sums = empty_sums(images, len(pairs.second))
         if first < last:
             samples = blocks.block(block)
             maps = empty_maps((last - first, blocks.shape[1]))
-            here = Sums(*(part[block] for part in sums))
-            _visit_rows(first, last, samples, pairs, state, scale, loss, maps, here)
+            _visit_rows(first, last, samples, pairs, state, scale, loss, maps, sums)
             if keep is not None:
                 keep(first, last, samples, maps)
+        return sums
 
-    with ThreadPoolExecutor(get_num_threads()) as threads:
-        list(threads.map(visit_block, range(blocks.count)))
+    total = empty_sums(images, len(pairs.second))
+    for sums in blocks.each(visit_block, "maps" if keep is not None else None):
+        for whole, part in zip(total, sums, strict=True):
+            whole += part
+    return total

@@ -11,7 +11,7 @@ from lommel.estimate.albedo_quality import deviations_from_mean, nmad
 from lommel.estimate.albedo_samples import clipped, orthomosaic
 
 FREE_SHARE = 4.0  # images whose scatter the overall noise counts for in the error of one post
-COMPARED = 2**24  # pixels of all images at most that tell how much these disagree
+COMPARED = 2**22  # pixels of all images at most that tell how much these disagree
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ class LastPass:
                 maps.image_count,
             ),
         )
-        part = first + int(np.ceil(self.share * (last - first)))
+        part = first + int(self.share * last) - int(self.share * first)
         here, shape = clipped(samples, first, part), (part - first, seen.shape[1])
         self.before[first] = deviations_from_mean(here, shape)
         self.after[first] = deviations_from_mean(

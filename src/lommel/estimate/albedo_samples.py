@@ -11,12 +11,14 @@ from numba import get_num_threads
 
 from lommel.estimate.albedo_arrays import BLOCKS, Pairs, Samples
 from lommel.estimate.albedo_light import ImageGeometry, TerrainPart
+from lommel.progress import silent
 from lommel.scene.geometry import surface_normals, unit, viewing_geometry
 from lommel.scene.grid import Window
 from lommel.scene.masks import feathering, pixel_weights, shadow_thresholds
 
 ROWS_AT_ONCE = 256  # rows of geometry in memory, 200 bytes per post
-PIXELS_AT_ONCE = 2**22  # of all images in one block of rows, so that a block has 100 MB
+PIXELS_AT_ONCE = 2**21  # of all images in one block of rows, 24 bytes each
+POSTS_AT_ONCE = 2**20  # of the grid in one block of rows, 100 bytes each
 KEPT_PIXELS = 2**26  # of all images whose samples are kept, 1.6 GB
 THIN = 2**22  # pixels that tell the level and the shadow threshold of an image
 STRIP = 32  # rows read together where not all are
@@ -104,9 +106,9 @@ def collect_samples(observations, grid, heights, model, masks, slope_noise):
 class SampleBlocks:
     r"""Samples of the images, some rows of the grid at a time.
 
-    What fits in memory is computed once and kept, what does not is computed anew in every pass
-    from the images and the heights: the same numbers either way. The expected variance of a pixel
-    is that of the terrain's texture and of its slopes,
+    Blocks of rows that fit in memory are computed once and kept, the others computed anew in every
+    pass from the images and the heights: the same numbers either way. The expected variance of a
+    pixel is that of the terrain's texture and of its slopes,
 
     .. math:: \sigma^2 \propto \ell^2 (R^2 + \kappa^2 |\nabla R|^2)
 
@@ -125,7 +127,8 @@ class SampleBlocks:
         :math:`\kappa`, slope error per relative error of brightness; None gives every pixel of
         every image the same variance.
     kept_pixels : int, optional
-        Pixels of all images up to which samples are kept, 24 bytes each; `KEPT_PIXELS`.
+        Pixels of all images whose samples are kept, 24 bytes each; `KEPT_PIXELS`.
+    progress : callable
 
     Attributes
     ----------
@@ -138,19 +141,30 @@ class SampleBlocks:
         1: every image tells its haze; see `lommel.estimate.albedo_cells.Cells`.
     reasons : list of str
         One per observation, empty where it is used.
+    passes : int
+        Over all images so far.
     """
 
-    def __init__(self, observations, grid, heights, model, masks, slope_noise, kept_pixels=None):
+    def __init__(
+        self,
+        observations,
+        grid,
+        heights,
+        model,
+        masks,
+        slope_noise,
+        kept_pixels=None,
+        progress=silent,
+    ):
         self.grid, self.heights, self.model = grid, heights, model
         self.shape = grid.shape
         self.masks, self.slope_noise = masks, slope_noise
-        thin = [_thinned(image.measured) for image in observations]
-        frames = [
-            Frame(image, threshold)
-            for image, threshold in zip(observations, shadow_thresholds(thin, masks), strict=True)
-        ]
+        self.progress, self.passes = progress, 0
+        thresholds = shadow_thresholds(ThinImages(observations, progress), masks)
         with ThreadPoolExecutor(get_num_threads()) as threads:
-            found = list(threads.map(self._level, frames))
+            seen = threads.map(self._look, observations, thresholds)
+            looks = list(progress(seen, "levels", len(observations), get_num_threads()))
+        frames, found = [frame for frame, _ in looks], [level for _, level in looks]
         self.reasons = [reason for _, _, reason in found]
         used = [k for k, reason in enumerate(self.reasons) if not reason]
         self.levels, self.brightness = np.array([found[k][:2] for k in used]).reshape(-1, 2).T
@@ -159,9 +173,11 @@ class SampleBlocks:
         self.windows = np.array(windows, np.int64).reshape(-1, 4)
         self.completeness = np.ones(len(used))
         self.pixels = int(np.sum(self.windows[:, 2] * self.windows[:, 3]))
-        self.count = max(BLOCKS, -(-self.pixels // PIXELS_AT_ONCE))
+        self.edges, above = block_edges(self.windows, self.shape)
+        self.count = len(self.edges) - 1
+        self._kept: dict[int, Samples] = {}
         kept_pixels = KEPT_PIXELS if kept_pixels is None else kept_pixels
-        self._kept = {} if self.pixels <= kept_pixels else None
+        self._keeps = int(np.searchsorted(above[self.edges[1:]], kept_pixels, side="right"))
 
     def keep(self, is_kept, reasons):
         """Leave out the used images of which ``is_kept`` is False, each for its reason."""
@@ -172,21 +188,39 @@ class SampleBlocks:
             setattr(self, name, getattr(self, name)[is_kept])
         self.frames = [frame for frame, kept in zip(self.frames, is_kept, strict=True) if kept]
         self.pixels = int(np.sum(self.windows[:, 2] * self.windows[:, 3]))
-        self._kept = None if self._kept is None else {}
+        self._kept = {}
 
     def span(self, block):
         """First row of a block, and the row behind its last one."""
-        rows = self.grid.shape[0]
-        size = -(-rows // self.count)
-        return min(block * size, rows), min((block + 1) * size, rows)
+        return self.edges[block], self.edges[block + 1]
 
     def block(self, block):
         """Samples of the rows of a block."""
-        if self._kept is None:
+        if block >= self._keeps:
             return self.rows(*self.span(block))
         if block not in self._kept:
             self._kept[block] = self.rows(*self.span(block))
         return self._kept[block]
+
+    def each(self, visit, name=None):
+        """One pass over the images: what a function of the number of a block gives, in order.
+
+        Parameters
+        ----------
+        visit : function (block)
+            Called from several threads.
+        name : str, optional
+            Of the pass; by default its number.
+
+        Yields
+        ------
+        result : object
+        """
+        self.passes += 1
+        name = f"{name or f'pass {self.passes}'}, block"
+        with ThreadPoolExecutor(get_num_threads()) as threads:
+            results = threads.map(visit, range(self.count))
+            yield from self.progress(results, name, self.count, get_num_threads())
 
     def rows(self, first, last):
         """Samples of the rows from first to before last; only these rows may be asked for.
@@ -233,8 +267,12 @@ class SampleBlocks:
         weight[~(reflectance > 0)] = 0.0
         return measured, geometry, weight, reflectance, gradient
 
+    def _look(self, image, threshold):
+        """An image as a `Frame`; its level, mean brightness, and why it cannot be used, if so."""
+        frame = Frame(image, threshold)
+        return frame, self._level(frame)
+
     def _level(self, frame):
-        """Level and mean brightness of an image, and why it cannot be used, if so."""
         step = max(1, -(-frame.window.rows * frame.window.cols // THIN))
         total, value, answer = 0.0, 0.0, 0.0
         has_ground = has_light = has_value = False
@@ -252,6 +290,35 @@ class SampleBlocks:
             if answer > 0:
                 return value / answer, value / total, ""
         return np.nan, np.nan, _reason(has_ground, has_light, has_value, frame.threshold)
+
+
+def block_edges(windows, shape):
+    """Where blocks of rows begin and the last one ends, so that one block fits in memory.
+
+    Parameters
+    ----------
+    windows : int64 array (images, 4)
+    shape : tuple of int
+        Of the grid.
+
+    Returns
+    -------
+    edges : list of int
+    above : int64 array (rows + 1,)
+        Pixels of all images above each row.
+    """
+    rows, cols = shape
+    starting = np.zeros(rows + 1, np.int64)
+    np.add.at(starting, windows[:, 0], windows[:, 3])
+    np.add.at(starting, windows[:, 0] + windows[:, 2], -windows[:, 3])
+    above = np.concatenate([[0], np.cumsum(np.cumsum(starting[:-1]))])
+    most = max(1, min(-(-rows // BLOCKS), POSTS_AT_ONCE // cols))
+    edges = [0]
+    while edges[-1] < rows:
+        first = edges[-1]
+        full = int(np.searchsorted(above, above[first] + PIXELS_AT_ONCE, side="right")) - 1
+        edges.append(min(max(full, first + 1), first + most, rows))
+    return edges, above
 
 
 class Frame:
@@ -335,12 +402,29 @@ def clipped(samples, first, last):
     return samples._replace(windows=windows, starts=starts)
 
 
-def _thinned(measured):
-    """At most about `THIN` pixels of an image, rows spread evenly."""
-    step = max(1, -(-measured.shape[0] * measured.shape[1] // THIN))
-    if step == 1:
-        return measured[:]
-    return np.concatenate([measured[row] for row in range(0, len(measured), step)])
+class ThinImages:
+    """At most about `THIN` pixels of each image, rows spread evenly; one image at a time.
+
+    Parameters
+    ----------
+    observations : list of Observation
+    progress : callable
+    """
+
+    def __init__(self, observations, progress):
+        self.images = [observation.measured for observation in observations]
+        self.progress = progress
+
+    def __len__(self):
+        """Number of images."""
+        return len(self.images)
+
+    def __iter__(self):
+        """The pixels of one image after the other, read anew where they wait on a disk."""
+        for measured in self.progress(self.images, "thresholds"):
+            step = max(1, -(-measured.shape[0] * measured.shape[1] // THIN))
+            rows = range(0, len(measured), step)
+            yield measured[:] if step == 1 else np.concatenate([measured[row] for row in rows])
 
 
 def _strips(window, every):

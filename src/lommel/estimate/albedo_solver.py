@@ -29,13 +29,12 @@ ROUGH = 1e-3  # tolerance there: only the noise scale is kept
 LONGEST = 0.5  # change of any unknown in one step; all are logarithms or of order 1
 
 
-def solve(problem, progress):
+def solve(problem):
     """Minimise the cost.
 
     Parameters
     ----------
     problem : Problem
-    progress : function (step, cost)
 
     Returns
     -------
@@ -54,19 +53,19 @@ def solve(problem, progress):
     point = visit(problem, state, np.log(levels.mean()), 1.0, ALONE)
     is_settled = settings.solver == "alternating" and settings.loss == "least-squares"
     if settings.solver == "alternating":
-        return problem, _descend(problem, point, [], is_settled, progress)
+        return problem, _descend(problem, point, [], is_settled)
     rough = replace(problem, settings=replace(settings, tolerance=max(ROUGH, settings.tolerance)))
-    solution = _descend(rough, point, [], is_settled, progress)
+    solution = _descend(rough, point, [], is_settled)
     for _ in range(TURNS):
         point = solution.value
         scale, repetition = weighting(point)
         if abs(np.log(scale / point.scale)) < SETTLED and point.repetition == 1.0:
             break
         point = visit(problem, point.state, point.mean_log_albedo, scale, 1.0)
-        solution = _descend(problem, point, solution.history, True, progress)
+        solution = _descend(problem, point, solution.history, True)
     for _ in range(TURNS):
         point = visit(problem, point.state, point.mean_log_albedo, scale, repetition)
-        solution = _descend(problem, point, solution.history, True, progress)
+        solution = _descend(problem, point, solution.history, True)
         point, before = solution.value, problem.settings.haze_error
         spread = haze_spread(problem, point, settings.haze_error)
         if abs(np.log(spread / before)) < STEADY:
@@ -94,7 +93,7 @@ def weighting(point):
     return scale if np.isfinite(scale) else 1.0, effective_repetition(point.sums)
 
 
-def _descend(problem, point, history, is_settled, progress):
+def _descend(problem, point, history, is_settled):
     """Steps until the cost stays; until settled, the noise scale follows them."""
     settings = problem.settings
     history, done = list(history), history[-1]["step"] if history else 0
@@ -106,7 +105,6 @@ def _descend(problem, point, history, is_settled, progress):
             is_settled = abs(np.log(scale / point.scale)) < SETTLED or step >= SETTLING
         moved, mean = _step(problem, point, damping)
         trial = visit(problem, moved, mean, scale, point.repetition)
-        progress(step + 1, trial.objective)
         if scale != point.scale:
             point = trial  # the cost has changed its meaning
             continue

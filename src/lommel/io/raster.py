@@ -18,6 +18,7 @@ import numpy as np
 import rasterio
 import rasterio.shutil
 from affine import Affine
+from rasterio._env import set_gdal_config
 from rasterio._err import CPLE_BaseError
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
@@ -44,7 +45,12 @@ COG = {
     "overview_resampling": "average",
     "num_threads": 2,
 }
+SCRATCH_ROWS = 128  # of these tiles while they are written: rows of all of them are in memory
+CACHE_MB = 128  # of blocks that GDAL holds; its default is a share of the machine
 MARGIN = 4  # pixels read around a window so that interpolation sees its neighbours
+
+if "GDAL_CACHEMAX" not in os.environ:
+    set_gdal_config("GDAL_CACHEMAX", CACHE_MB)
 
 
 @dataclass(frozen=True)
@@ -384,7 +390,7 @@ def raster_writer(path, grid, description, unit="", dtype=np.float32, nodata=np.
     profile = _profile(grid, dtype, nodata) | {
         "tiled": True,
         "blockxsize": BLOCK,
-        "blockysize": BLOCK,
+        "blockysize": SCRATCH_ROWS,
         "sparse_ok": True,
         "bigtiff": "if_safer",
     }

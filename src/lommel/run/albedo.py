@@ -4,7 +4,6 @@ Most callers want `run_albedo`.
 """
 
 import csv
-from contextlib import closing
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -16,12 +15,14 @@ from lommel.estimate.albedo_quality import (
     slope_towards_sun,
 )
 from lommel.estimate.albedo_settings import AlbedoSettings, published_settings
+from lommel.progress import silent
+from lommel.run.albedo_plan import plan_albedo
 from lommel.run.albedo_products import Products
 from lommel.run.inputs import GridSettings, SceneFiles, Skipped
-from lommel.run.mixed_scene import raw_cameras, read_mixed_scene
+from lommel.run.mixed_scene import place_scene, raw_cameras, read_placed
 from lommel.run.products import RunRecord, output_folder
 from lommel.run.register import settle_cameras
-from lommel.run.stored_rows import RowStore
+from lommel.run.stored_rows import Held
 
 SHARED_NAMES = ("phase_c1_per_rad", "phase_c2", "falloff_v2_per_rad2", "falloff_v4_per_rad4")
 
@@ -57,10 +58,13 @@ def run_albedo(
     settings: AlbedoSettings | None = None,
     grid_settings: GridSettings | None = None,
     overwrite: bool = False,
-    progress=iter,
+    progress=silent,
     registers: bool = False,
+    memory: float | None = None,
 ):
     """Estimate albedo and exposures from orthoimages or raw images and write the products.
+
+    A run whose images do not fit in memory can be broken off: the same request goes on.
 
     Parameters
     ----------
@@ -71,9 +75,11 @@ def run_albedo(
     grid_settings : GridSettings, optional
     overwrite : bool
     progress : callable
-        Wraps the iterable of images.
+        Shows how far each step is; see `lommel.progress.silent`.
     registers : bool
         Register raw images to the DEM first; otherwise they are only checked.
+    memory : float, bytes, optional
+        As of `plan_albedo`; it does not change the products.
 
     Returns
     -------
@@ -86,16 +92,28 @@ def run_albedo(
         asdict(settings)
         | {"grid": asdict(grid_settings or GridSettings()), "registers": registers},
     )
-    with output_folder(output, overwrite) as folder, closing(RowStore(folder)) as store:
+    with output_folder(output, overwrite) as folder:
         with record.stage("read"):
-            settled, lost, remark = settle_cameras(files, folder, registers, raw_cameras(files))
-            scene = read_mixed_scene(settled, grid_settings, progress=progress, store=store)
-            record.add_inputs([*files.images, *files.dems, *files.cameras])
             tables = (files.sun_positions, files.spacecraft_positions)
-            record.add_inputs([path for path in tables if path is not None])
-        with record.stage("solve"), Products(folder, scene.grid) as products:
+            inputs = [*files.images, *files.dems, *files.cameras, *filter(None, tables)]
+            record.add_inputs(inputs, progress)
+            settled, lost, remark = settle_cameras(
+                files, folder, registers, raw_cameras(files), progress
+            )
+            placed = place_scene(settled, grid_settings, progress=progress)
+            plan = plan_albedo(placed, settings, memory)
+            kept = _kept(plan, record, output)
+            scene = read_placed(placed, progress, kept.rows)
+        with record.stage("solve"), plan.limits(), Products(folder, scene.grid) as products:
             result = estimate_albedo(
-                scene.observations, scene.grid, scene.heights, settings, take=products.take
+                scene.observations,
+                scene.grid,
+                scene.heights,
+                settings,
+                progress,
+                products.take,
+                plan.kept_pixels,
+                kept.photometry,
             )
         with record.stage("write"):
             names = [observation.name for observation in scene.observations]
@@ -108,7 +126,17 @@ def run_albedo(
         record.history = result.history
         record.outcome = {"name": result.outcome, "sentence": result.advice + remark}
         record.write(folder)
+    kept.remove()
     return record.results
+
+
+def _kept(plan, record, output):
+    """Where images and photometry wait: in memory, or beside the output."""
+    if not plan.waits_on_disk:
+        return Held()
+    from lommel.run.albedo_records import Kept  # and what it needs to keep things
+
+    return Kept(output, plan, record)
 
 
 def _write_exposures(path, names, result, skipped):

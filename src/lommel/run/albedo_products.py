@@ -12,8 +12,8 @@ from lommel.estimate.albedo_maps import MapRows
 from lommel.io.raster import raster_writer
 from lommel.scene.grid import Window
 
-THIN_POSTS = 2**24  # of the map kept to judge its brightness as a whole
-DETAIL_POSTS = 2**22  # of the part in the middle kept to look for shading
+THIN_POSTS = 2**20  # of the map kept to judge its brightness as a whole
+DETAIL_POSTS = 2**20  # of the part in the middle kept to look for shading
 
 
 class Products:

@@ -5,13 +5,13 @@ second revolution under the evening Sun, gives the refined terrain. Most callers
 """
 
 import csv
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from lommel.errors import InputError
 from lommel.evaluate import relative_errors
+from lommel.progress import silent
 from lommel.run.albedo import run_albedo
 from lommel.run.evaluate import evaluate_product
 from lommel.run.inputs import SceneFiles
@@ -27,11 +27,7 @@ TARGETS = {
 }
 
 
-def _silent(iterable, description=""):
-    return iterable
-
-
-def run_demo(output, overwrite=False, progress=_silent, strip="apollo-orbit", close_up="sfs-patch"):
+def run_demo(output, overwrite=False, progress=silent, strip="apollo-orbit", close_up="sfs-patch"):
     """Simulate, estimate, compare.
 
     Parameters
@@ -39,8 +35,8 @@ def run_demo(output, overwrite=False, progress=_silent, strip="apollo-orbit", cl
     output : path
         Folder that appears when all is done: ``scene``, ``albedo``, ``sfs`` and ``run.json``.
     overwrite : bool
-    progress : callable (iterable, description)
-        Wraps the iterables of each stage, as ``rich.progress.track`` does.
+    progress : callable
+        Shows how far each step is; see `lommel.progress.silent`.
     strip, close_up : str or path
         Scenes, as `run_simulate` takes them.
 
@@ -138,8 +134,11 @@ def _read_exposures(path):
     return {row["image"]: float(row["exposure"] or "nan") for row in rows}
 
 
-def _named(progress, description):
-    return partial(progress, description=description)
+def _named(progress, stage):
+    def named(items, name, total=None, at_once=1):
+        return progress(items, f"{stage}: {name}", total, at_once)
+
+    return named
 
 
 def _files(scene):

@@ -13,6 +13,7 @@ import numpy as np
 from lommel.errors import GeometryError, InputError, LommelError, UnreadableError
 from lommel.io.positions import find_position, read_positions
 from lommel.io.raster import raster_info, read_grid, read_image_on_grid, read_on_grid
+from lommel.progress import silent
 from lommel.scene.body import MOON
 from lommel.scene.geometry import Observation
 from lommel.scene.grid import Grid, Window, bounds_in, grid_from_bounds, read_crs
@@ -106,8 +107,7 @@ def read_scene(
     grid_settings=None,
     prefer="images",
     body=MOON,
-    progress=iter,
-    store=None,
+    progress=silent,
     is_part=False,
 ):
     """Terrain and images on one grid.
@@ -121,9 +121,7 @@ def read_scene(
         Whose posts the automatic grid takes over.
     body : Body
     progress : callable
-        Wraps the iterable of images, as ``rich.progress.track`` does.
-    store : function (observation), optional
-        Gives each observation back when it is read, its image perhaps stored elsewhere.
+        Shows how far each step is; see `lommel.progress.silent`.
     is_part : bool
         The images have been read before, for all of the scene: one that cannot be read now is no
         longer left out, but an `UnreadableError`.
@@ -132,7 +130,6 @@ def read_scene(
     -------
     scene : Scene
     """
-    store = store or _as_it_is
     refuse_duplicates(files.images)
     if not files.dems:
         raise InputError("No DEM given. Name at least one with --dem.")
@@ -147,10 +144,9 @@ def read_scene(
     refuse_unusable(grid)
     heights = read_heights(files.dems, grid, body)
     observations = []
-    for path in progress(list(image_grids)):
+    for path in progress(list(image_grids), "images"):
         try:
-            seen = observe(path, image_grids[path], grid, heights, tables, body)
-            observations.append(store(seen))
+            observations.append(observe(path, image_grids[path], grid, heights, tables, body))
         except LommelError as error:
             skipped.append(left_out(path, error, is_part))
     if not observations:
@@ -258,10 +254,6 @@ def _mean_heights(paths, grid, body):
         total[window.slices] += np.where(known, part, 0.0)
         count[window.slices] += known
     return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
-
-
-def _as_it_is(observation):
-    return observation
 
 
 def left_out(path, error, is_part):

@@ -1,37 +1,98 @@
 """What `lommel albedo` reads: orthoimages, and raw images brought onto the DEM on the way.
 
 An image is raw when a camera is named for it, or when it has no CRS and its camera is in a file
-beside it or in its ISIS label. Most callers want `read_mixed_scene`.
+beside it or in its ISIS label. Where images lie is told by headers and cameras (`place_scene`);
+their pixels and the DEM are then read some rows at a time (`read_placed`), in parts that do not
+depend on the memory there is. Most callers want `read_mixed_scene`.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from lommel.errors import GeometryError, InputError, LommelError
 from lommel.io.cameras import find_camera
-from lommel.io.raster import raster_info
+from lommel.io.positions import find_position
+from lommel.io.raster import raster_info, read_image_on_grid
+from lommel.progress import silent
 from lommel.run.inputs import (
     GridSettings,
     Scene,
     Skipped,
     choose_grid,
+    known_heights,
     listing,
-    observe,
     place_images,
-    read_heights,
     read_position_tables,
-    read_scene,
     refuse_duplicates,
     refuse_unusable,
 )
 from lommel.run.orthoproject import common_gsd, ortho_grid
-from lommel.run.raw_images import Terrain, read_raw_images, show_pixels, view_window
+from lommel.run.raw_images import RawImage, Terrain, read_raw_images, show_pixels, view_window
+from lommel.run.stored_rows import Held
 from lommel.scene.body import MOON
 from lommel.scene.geometry import Observation
+from lommel.scene.grid import Grid, Window
+
+POSTS_AT_ONCE = 2**21  # of terrain or of an orthoimage while it is read
+SQUARE = 768  # posts along each side of the parts of a raw image, 500 bytes each
 
 
-def read_mixed_scene(files, grid_settings=None, body=MOON, progress=iter, store=None):
+@dataclass(frozen=True)
+class Place:
+    """Where an image lies on the grid.
+
+    Attributes
+    ----------
+    path : Path
+    window : Window
+    raw : RawImage or None
+        None for an orthoimage.
+    relief : float, m
+        Highest minus lowest terrain that a raw image sees.
+    """
+
+    path: Path
+    window: Window
+    raw: RawImage | None = None
+    relief: float = 0.0
+
+
+@dataclass(frozen=True)
+class PlacedScene:
+    """A scene of which no pixel has been read.
+
+    Attributes
+    ----------
+    grid : Grid
+    terrain : Terrain
+    places : list of Place
+        In the order of the files.
+    tables : list
+        Positions for orthoimages, as `read_position_tables`.
+    skipped : list of Skipped
+    """
+
+    grid: Grid
+    terrain: Terrain
+    places: list[Place]
+    tables: list
+    skipped: list[Skipped]
+
+    @property
+    def pixels(self):
+        """Posts in the windows of all images."""
+        return sum(place.window.rows * place.window.cols for place in self.places)
+
+    @property
+    def raw_pixels(self):
+        """The same, of raw images alone."""
+        windows = [place.window for place in self.places if place.raw is not None]
+        return sum(window.rows * window.cols for window in windows)
+
+
+def read_mixed_scene(files, grid_settings=None, body=MOON, progress=silent, store=Held.rows):
     """Terrain, orthoimages and raw images on one grid.
 
     Parameters
@@ -39,52 +100,164 @@ def read_mixed_scene(files, grid_settings=None, body=MOON, progress=iter, store=
     files : SceneFiles
     grid_settings : GridSettings, optional
     body : Body
-    progress : callable
-        Wraps the iterable of images, as ``rich.progress.track`` does.
-    store : function (observation), optional
-        As in `read_scene`.
+    progress, store
+        As of `read_placed`.
 
     Returns
     -------
     scene : Scene
         The spacecraft of a line-scan image stands where it was at the middle line.
     """
+    return read_placed(place_scene(files, grid_settings, body, progress), progress, store)
+
+
+def place_scene(files, grid_settings=None, body=MOON, progress=silent):
+    """The grid and where the images lie on it.
+
+    Parameters
+    ----------
+    files : SceneFiles
+    grid_settings : GridSettings, optional
+    body : Body
+    progress : callable
+
+    Returns
+    -------
+    placed : PlacedScene
+    """
     refuse_duplicates(files.images)
-    cameras = raw_cameras(files)
-    if not any(cameras):
-        return read_scene(files, grid_settings, "images", body, progress, store)
-    settings = grid_settings or GridSettings()
-    pairs = [pair for pair in zip(files.images, cameras, strict=True) if pair[1] is not None]
-    images, skipped = read_raw_images(
-        replace(files, images=tuple(i for i, _ in pairs), cameras=tuple(c for _, c in pairs)), body
-    )
-    terrain = Terrain(files.dems, body)
-    placed, more = _place_raw(images, terrain, settings)
-    flat = [path for path, camera in zip(files.images, cameras, strict=True) if camera is None]
-    tables = read_position_tables(files, body) if flat else ()
-    flat_grids, others = place_images(flat, terrain.grids, body)
-    skipped += more + others
-    grids = [*flat_grids.values(), *(grid for _, grid, _ in placed)]
-    if not grids:
+    if not files.dems:
+        raise InputError("No DEM given. Name at least one with --dem.")
+    cameras = dict(zip(files.images, raw_cameras(files), strict=True))
+    settings, terrain, skipped = grid_settings or GridSettings(), Terrain(files.dems, body), []
+    raw = {image: camera for image, camera in cameras.items() if camera is not None}
+    flat = [path for path in files.images if path not in raw]
+    tables = read_position_tables(files, body) if flat else []
+    own, found = {}, {}
+    if raw:
+        pairs = replace(files, images=tuple(raw), cameras=tuple(raw.values()))
+        images, skipped = read_raw_images(pairs, body)
+        views, more = _place_raw(images, terrain, settings, progress)
+        skipped += more
+        found = {image.path: (image, relief) for image, _, relief in views}
+        own = {image.path: grid for image, grid, _ in views}
+    flat_grids, more = place_images(flat, terrain.grids, body)
+    skipped += more
+    own = flat_grids | own
+    if not own:
         raise InputError("No image can be used.\n" + listing(skipped))
-    grid = choose_grid(grids, terrain.grids, settings, "images", body)
+    grid = choose_grid(list(own.values()), terrain.grids, settings, "images", body)
     refuse_unusable(grid)
-    heights = read_heights(files.dems, grid, body)
-    found = {}
-    for task in progress([*placed, *flat_grids.items()]):
-        path = task[0].path if len(task) == 3 else task[0]
+    places = []
+    for path in (path for path in files.images if path in own):
+        window = own[path].footprint(grid)
+        if window.is_empty or (path in found and min(window.shape) < 2):
+            skipped.append(Skipped(path.name, f"{path.name} does not overlap the output grid."))
+            continue
+        places.append(Place(path, window, *found.get(path, ())))
+    return PlacedScene(grid, terrain, places, tables, skipped)
+
+
+def read_placed(placed, progress=silent, store=Held.rows):
+    """Terrain and images of a placed scene.
+
+    Parameters
+    ----------
+    placed : PlacedScene
+    progress : callable
+        Shows how far each step is; see `lommel.progress.silent`.
+    store : function (name, shape, parts)
+        Puts the arrays of an iterator, which follow each other from north to south, together to one
+        of a shape; `Held.rows` in memory.
+
+    Returns
+    -------
+    scene : Scene
+    """
+    grid, skipped, observations = placed.grid, list(placed.skipped), []
+    heights = store("heights", grid.shape, _terrain_rows(placed, progress))
+    for number, place in enumerate(progress(placed.places, "images")):
         try:
-            if len(task) == 3:
-                found[path] = _observe_raw(*task, grid, terrain)
-            else:
-                found[path] = observe(*task, grid, heights, tables, body)
-            if store is not None:
-                found[path] = store(found[path])
-        except LommelError as error:
-            skipped.append(Skipped(path.name, str(error)))
-    if not found:
+            sun, craft, saturation = _circumstances(place, placed)
+            rows = _checked_rows(place, placed, heights)
+            measured = store(f"image-{number:05d}", place.window.shape, rows)
+        except (InputError, GeometryError) as error:  # a full disk is none of them
+            skipped.append(Skipped(place.path.name, str(error)))
+            continue
+        name = place.path.name
+        observations.append(Observation(name, place.window, measured, sun, craft, saturation))
+    if not observations:
         raise InputError("No image can be used.\n" + listing(skipped))
-    return Scene(grid, heights, [found[path] for path in files.images if path in found], skipped)
+    return Scene(grid, heights, observations, skipped)
+
+
+def bands(window, rows):
+    """Parts of a window of so many rows at most, all columns each, from north to south."""
+    for first in range(0, window.rows, rows):
+        yield replace(window, row=window.row + first, rows=min(rows, window.rows - first))
+
+
+def _terrain_rows(placed, progress):
+    """Heights of the grid, some rows at a time."""
+    parts = list(bands(placed.grid.window, max(1, POSTS_AT_ONCE // placed.grid.shape[1])))
+    is_known = False
+    for part in progress(parts, "terrain"):
+        heights = known_heights(placed.terrain.paths, placed.grid.cut(part), placed.terrain.body)
+        is_known |= bool(np.isfinite(heights).any())
+        yield heights
+    if not is_known:
+        raise InputError(
+            "The DEM has no height inside the output grid. Check --bounds, and that DEM and "
+            "images show the same region."
+        )
+
+
+def _circumstances(place, placed):
+    """Where Sun and spacecraft stood, and the value at which the image clips."""
+    info = raster_info(place.path, placed.terrain.body)
+    if place.raw is not None:
+        return place.raw.sun, place.raw.camera.position, info.saturation
+    name = place.path.name
+    sun, craft = (find_position(table, name, source) for source, table in placed.tables)
+    return sun, craft, info.saturation
+
+
+def _checked_rows(place, placed, heights):
+    """Brightness in the window of an image, some rows at a time; an error at the end without."""
+    read = _flat_rows if place.raw is None else _raw_rows
+    has_value = has_ground = False
+    for part, values in read(place, placed):
+        is_known = np.isfinite(values)
+        has_value |= bool(is_known.any())
+        has_ground |= bool((is_known & np.isfinite(heights[part.slices])).any())
+        yield values
+    name = place.path.name
+    if not has_value and place.raw is None:
+        raise GeometryError(f"{name} holds no brightness: all is shadow, clipped or no data.")
+    if not has_ground:
+        raise GeometryError(f"{name} has no valid pixel where the DEM is known.")
+
+
+def _flat_rows(place, placed):
+    for part in bands(place.window, max(1, POSTS_AT_ONCE // place.window.cols)):
+        yield part, read_image_on_grid(place.path, placed.grid.cut(part), placed.terrain.body)
+
+
+def _raw_rows(place, placed):
+    for row, rows in _shares(place.window.rows):
+        part = replace(place.window, row=place.window.row + row, rows=rows)
+        values = np.empty(part.shape, np.float32)
+        for col, cols in _shares(part.cols):
+            square = Window(part.row, part.col + col, rows, cols)
+            tile, _ = view_window(place.raw, placed.grid, square, placed.terrain, place.relief)
+            values[:, col : col + cols] = show_pixels(place.raw, tile)
+        yield part, values
+
+
+def _shares(size):
+    """Begin and length of about equal parts of a side, `SQUARE` long at most."""
+    edges = np.linspace(0, size, -(-size // SQUARE) + 1).astype(int).tolist()
+    return [(first, last - first) for first, last in zip(edges[:-1], edges[1:], strict=True)]
 
 
 def raw_cameras(files):
@@ -105,11 +278,11 @@ def _own_camera(path):
         return None  # reported when the image is read
 
 
-def _place_raw(images, terrain, settings):
+def _place_raw(images, terrain, settings, progress):
     """Image, grid of its part of the DEM and relief there; and the images that cannot be placed."""
     placed, skipped = [], []
     gsd = common_gsd(images, terrain)
-    for image in images:
+    for image in progress(images, "footprints"):
         try:
             if image.sun is None:
                 raise InputError(
@@ -120,16 +293,3 @@ def _place_raw(images, terrain, settings):
         except LommelError as error:
             skipped.append(Skipped(image.name, str(error)))
     return placed, skipped
-
-
-def _observe_raw(image, image_grid, relief, grid, terrain):
-    window = image_grid.footprint(grid)
-    if window.is_empty or min(window.shape) < 2:
-        raise GeometryError(f"{image.name} does not overlap the output grid.")
-    tile, heights = view_window(image, grid, window, terrain, relief)
-    values = show_pixels(image, tile)
-    if not (np.isfinite(values) & np.isfinite(heights)).any():
-        raise GeometryError(f"{image.name} has no valid pixel where the DEM is known.")
-    saturation = raster_info(image.path).saturation
-    position = image.camera.position
-    return Observation(image.name, window, values, image.sun, position, saturation)

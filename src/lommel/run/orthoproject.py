@@ -10,6 +10,7 @@ import numpy as np
 
 from lommel.errors import InputError, LommelError
 from lommel.io.raster import BLOCK, raster_writer
+from lommel.progress import silent
 from lommel.run.inputs import (
     DEM_IS_FINE_ENOUGH,
     GridSettings,
@@ -44,7 +45,7 @@ def run_orthoproject(
     output,
     grid_settings: GridSettings | None = None,
     overwrite: bool = False,
-    progress=iter,
+    progress=silent,
 ):
     """Bring raw images onto a DEM and write them with their backplanes.
 
@@ -56,7 +57,7 @@ def run_orthoproject(
     grid_settings : GridSettings, optional
     overwrite : bool
     progress : callable
-        Wraps the iterable of images.
+        Shows how far each step is; see `lommel.progress.silent`.
 
     Returns
     -------
@@ -69,10 +70,10 @@ def run_orthoproject(
         with record.stage("orthoproject"):
             images, skipped = read_raw_images(files)
             terrain = Terrain(files.dems)
-            record.add_inputs([*files.images, *files.dems, *files.cameras])
+            record.add_inputs([*files.images, *files.dems, *files.cameras], progress)
             done = {}
             gsd = common_gsd(images, terrain)
-            for image in progress(images):
+            for image in progress(images, "images"):
                 try:
                     grid, relief = ortho_grid(image, terrain, settings, gsd)
                     done[image.name] = write_orthoimage(folder, image, grid, terrain, relief)

@@ -20,6 +20,7 @@ from pathlib import Path
 
 from lommel import __version__
 from lommel.errors import InputError, LommelError
+from lommel.progress import silent
 
 ANGLES = ("max_incidence", "max_emission", "terrain_roughness")  # settings in rad
 PACKAGES = ("numpy", "numba", "scipy", "rasterio", "pyproj")
@@ -145,9 +146,9 @@ class RunRecord:
             {"name": name, "seconds": round(seconds, 3), "peak_memory_mb": round(peak, 1)}
         )
 
-    def add_inputs(self, paths):
+    def add_inputs(self, paths, progress=silent):
         """Note size and digest of input files; files that cannot be read are noted as such."""
-        self.inputs.extend(_digest(Path(path)) for path in paths)
+        self.inputs.extend(_digest(Path(path)) for path in progress(paths, "digests of inputs"))
 
     def add_skipped(self, skipped):
         """Note images left out: objects with ``name`` and ``reason``."""

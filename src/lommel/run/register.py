@@ -12,6 +12,7 @@ import numpy as np
 from lommel.errors import GeometryError, LommelError
 from lommel.io.cameras import find_camera
 from lommel.io.isd import write_isd
+from lommel.progress import silent
 from lommel.run.inputs import SceneFiles, Skipped, listing
 from lommel.run.products import RunRecord, output_folder
 from lommel.run.raw_images import Terrain, read_raw_images
@@ -33,7 +34,7 @@ def run_register(
     output,
     settings: RegistrationSettings | None = None,
     overwrite: bool = False,
-    progress=iter,
+    progress=silent,
 ):
     """Register raw images to a DEM and to each other, and write their corrected cameras.
 
@@ -45,7 +46,7 @@ def run_register(
     settings : RegistrationSettings, optional
     overwrite : bool
     progress : callable
-        Wraps the iterable of images.
+        Shows how far each step is; see `lommel.progress.silent`.
 
     Returns
     -------
@@ -58,7 +59,7 @@ def run_register(
         with record.stage("read"):
             images, skipped = read_raw_images(files)
             tables = [files.sun_positions] if files.sun_positions else []
-            record.add_inputs([*files.images, *files.dems, *files.cameras, *tables])
+            record.add_inputs([*files.images, *files.dems, *files.cameras, *tables], progress)
         with record.stage("register"):
             states, failed = register_images(images, Terrain(files.dems), settings, progress)
             known = placed(states)
@@ -78,7 +79,7 @@ def run_register(
     return record.results
 
 
-def register_images(images, terrain, settings, progress=iter):
+def register_images(images, terrain, settings, progress=silent):
     """Register images to the terrain and among each other.
 
     Parameters
@@ -87,7 +88,7 @@ def register_images(images, terrain, settings, progress=iter):
     terrain : Terrain
     settings : RegistrationSettings
     progress : callable
-        Wraps the iterable of images.
+        Shows how far each step is; see `lommel.progress.silent`.
 
     Returns
     -------
@@ -97,16 +98,16 @@ def register_images(images, terrain, settings, progress=iter):
         Images that could not be looked at.
     """
     states, failed = [], []
-    for image in progress(images):
+    for image in progress(images, "images on terrain"):
         try:
             states.append(register_to_terrain(image, terrain, settings))
         except LommelError as error:
             failed.append(Skipped(image.name, str(error)))
-    tie_images(states, settings)
+    tie_images(states, settings, progress)
     return states, failed
 
 
-def settle_cameras(files, folder, registers=False, cameras=None):
+def settle_cameras(files, folder, registers=False, cameras=None, progress=silent):
     """Cameras of raw images, registered or only checked, before another stage uses them.
 
     Parameters
@@ -119,6 +120,7 @@ def settle_cameras(files, folder, registers=False, cameras=None):
         Without it, images that are visibly off are only named.
     cameras : sequence of path or None, optional
         Camera of each image, None for an orthoimage; by default those named or found.
+    progress : callable
 
     Returns
     -------
@@ -138,8 +140,8 @@ def settle_cameras(files, folder, registers=False, cameras=None):
     images = [image for image in images if image.sun is not None]
     terrain, settings = Terrain(files.dems), RegistrationSettings()
     if not registers:
-        return files, [], _remark(images, terrain, settings)
-    states, _ = register_images(images, terrain, settings)
+        return files, [], _remark(images, terrain, settings, progress)
+    states, _ = register_images(images, terrain, settings, progress)
     found = placed(states)
     lost = []
     for number, state in enumerate(states):
@@ -158,9 +160,9 @@ def settle_cameras(files, folder, registers=False, cameras=None):
     return files, lost, remark
 
 
-def _remark(images, terrain, settings):
+def _remark(images, terrain, settings, progress):
     off = {}
-    for image in images:
+    for image in progress(images, "cameras"):
         with suppress(LommelError):  # reported by the stage itself
             off[image.name] = visible_offset(image, terrain, settings)
     seen = [f"{name} by {offset:.0f} m" for name, offset in off.items() if offset > 0]

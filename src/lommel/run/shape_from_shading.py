@@ -20,6 +20,7 @@ from lommel.estimate.problem import lambert_image
 from lommel.estimate.shape_from_shading import SolverSettings, correlation, solve_surface
 from lommel.estimate.surface import Surface
 from lommel.io.raster import write_raster
+from lommel.progress import silent, step
 from lommel.run.inputs import GridSettings, SceneFiles
 from lommel.run.photometry import read_known
 from lommel.run.products import RunRecord, output_folder
@@ -70,7 +71,7 @@ def run_shape_from_shading(
     settings: SfsSettings | None = None,
     grid_settings: GridSettings | None = None,
     overwrite: bool = False,
-    progress=iter,
+    progress=silent,
     tiling=None,
 ):
     """Refine a DEM by the shading in images and write the products.
@@ -86,7 +87,7 @@ def run_shape_from_shading(
     grid_settings : GridSettings, optional
     overwrite : bool
     progress : callable
-        Wraps the iterable of images.
+        Shows how far each step is; see `lommel.progress.silent`.
     tiling : Tiling, optional
         Memory, engine and size of tiles.
 
@@ -104,7 +105,7 @@ def run_shape_from_shading(
     record = RunRecord("sfs", asdict(settings) | {"grid": asdict(grid_settings or GridSettings())})
     with output_folder(output, overwrite) as folder:
         with record.stage("read"):
-            settled, lost, remark = _settled(files, folder, settings.registers)
+            settled, lost, remark = _settled(files, folder, settings.registers, progress)
             if plan_tiles(settled, grid_settings, tiling, output).is_tiled:
                 from lommel.run.tiles import run_tiles  # and what it needs to share work
 
@@ -112,16 +113,16 @@ def run_shape_from_shading(
                     files, settled, lost, folder, output, settings, grid_settings, tiling, progress
                 )
             scene = read_views(settled, grid_settings, settings.masks, progress=progress)
-            record.add_inputs([*files.images, *files.dems])
             tables = (files.sun_positions, files.spacecraft_positions)
-            record.add_inputs([*files.cameras, *filter(None, tables)])
+            inputs = [*files.images, *files.dems, *files.cameras, *filter(None, tables)]
+            record.add_inputs(inputs, progress)
             record.add_skipped([*lost, *scene.skipped])
             _refuse_small(scene.grid)
             names = [view.name for view in scene.views]
             cells = cell_grid(scene.grid)
             albedo, photometry = read_known(settings.albedo, settings.exposures, cells, names)
             record.add_inputs([*filter(None, (settings.albedo, settings.exposures))])
-        with record.stage("solve"):
+        with record.stage("solve"), step(progress, "surface"):
             known = np.isfinite(scene.heights)
             measured = measured_posts(scene.heights)
             initial = fill_holes(
@@ -142,7 +143,7 @@ def run_shape_from_shading(
             )
         if not settings.registers:
             remark = _doubt(files, scene.views, solution.value.correlations, folder)
-        with record.stage("write"):
+        with record.stage("write"), step(progress, "products"):
             refined = surface.heights_from_posts(solution.value.u)
             seen = seen_posts(solution.value.measured)
             if measured is not None:
@@ -158,13 +159,13 @@ def run_shape_from_shading(
     return record.results
 
 
-def _settled(files, folder, registers):
+def _settled(files, folder, registers, progress):
     """Files with registered cameras, images lost on the way, and a remark."""
     if not registers:
         return files, [], ""
     from lommel.run.register import settle_cameras  # slow to import
 
-    return settle_cameras(files, folder, registers)
+    return settle_cameras(files, folder, registers, progress=progress)
 
 
 def _doubt(files, views, correlations, folder):

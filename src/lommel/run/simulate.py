@@ -13,6 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from lommel.errors import InputError
 from lommel.io.raster import write_raster
+from lommel.progress import silent
 from lommel.run.products import RunRecord, output_folder
 from lommel.simulate import PRESETS, SceneSettings, preset, simulate_scene
 
@@ -64,7 +65,7 @@ class SceneFolder:
         return self.folder / "spacecraft-positions.txt"
 
 
-def run_simulate(scene, output, overwrite=False, progress=iter):
+def run_simulate(scene, output, overwrite=False, progress=silent):
     """Simulate a preset or a scene file into a folder.
 
     Parameters
@@ -75,7 +76,7 @@ def run_simulate(scene, output, overwrite=False, progress=iter):
     output : path
     overwrite : bool
     progress : callable
-        Wraps the iterable of frames, as ``rich.progress.track`` does.
+        Shows how far each step is; see `lommel.progress.silent`.
 
     Returns
     -------

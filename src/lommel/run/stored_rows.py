@@ -1,16 +1,45 @@
-"""Images on the run's grid that do not fit in memory: their rows wait on the disk.
+"""Images and terrain on the run's grid: held in memory, or waiting on the disk row by row.
 
-Most callers want `RowStore`.
+Most callers want `Held` and `StoredRows`.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from lommel.errors import InputError
 
-HELD_BYTES = 2**28  # of images in memory; what comes beyond goes to the disk
+class Held:
+    """Keeps what a run has found in memory, so that a run that is broken off begins anew.
+
+    See `lommel.run.albedo_records.Kept` for runs that are worth more.
+    """
+
+    photometry = None
+
+    @staticmethod
+    def rows(name, shape, parts):
+        """Parts of an array, one below the other.
+
+        Parameters
+        ----------
+        name : str
+            Of the array; only one that is kept needs it.
+        shape : tuple of int
+        parts : iterable of float32 array (some rows, cols)
+
+        Returns
+        -------
+        values : float32 array (rows, cols)
+        """
+        values, row = np.empty(shape, np.float32), 0
+        for part in parts:
+            values[row : row + len(part)] = part
+            row += len(part)
+        return values
+
+    def remove(self):
+        """Nothing is left."""
 
 
 @dataclass(frozen=True)
@@ -31,46 +60,12 @@ class StoredRows:
         """Number of rows."""
         return self.shape[0]
 
-    def __getitem__(self, rows):
-        """Some rows, read anew."""
+    def __getitem__(self, index):
+        """Some rows, or some columns of them, read anew."""
+        rows, *cols = index if isinstance(index, tuple) else (index,)
         if not isinstance(rows, slice):
-            return self[rows : rows + 1][0]
+            return self[(slice(rows, rows + 1), *cols)][0]
         first, last, _ = rows.indices(len(self))
-        size, cols = max(last - first, 0), self.shape[1]
-        values = np.fromfile(self.path, np.float32, size * cols, offset=4 * first * cols)
-        return values.reshape(size, cols)
-
-
-class RowStore:
-    """Keeps observations, the first ones in memory and the others on the disk.
-
-    Parameters
-    ----------
-    folder : Path
-        Where files are written; removed by `close`.
-    """
-
-    def __init__(self, folder):
-        self.folder, self.held, self.paths = Path(folder), 0, []
-
-    def __call__(self, observation):
-        """The observation, its image where it fits."""
-        measured = observation.measured
-        if self.held + measured.nbytes <= HELD_BYTES:
-            self.held += measured.nbytes
-            return observation
-        path = self.folder / f".{len(self.paths)}.rows"
-        self.paths.append(path)
-        try:
-            measured.tofile(path)
-        except OSError as error:
-            raise InputError(
-                f"{path} cannot be written: {error}. Images beyond {HELD_BYTES / 1e6:.0f} MB wait "
-                "on the disk; free some, name another --output or give a larger --spacing."
-            ) from error
-        return replace(observation, measured=StoredRows(path, measured.shape))
-
-    def close(self):
-        """Remove the files."""
-        for path in self.paths:
-            path.unlink(missing_ok=True)
+        size, width = max(last - first, 0), self.shape[1]
+        values = np.fromfile(self.path, np.float32, size * width, offset=4 * first * width)
+        return values.reshape(size, width)[(slice(None), *cols)]

@@ -12,6 +12,7 @@ import numpy as np
 from lommel.errors import LommelError
 from lommel.estimate.registration import TERRAIN, join_matches
 from lommel.estimate.registration_matching import SHORTEST
+from lommel.progress import silent
 from lommel.run.map_matching import match_patches, match_whole_map
 from lommel.run.match_terrain import image_pair
 from lommel.run.register_to_terrain import (
@@ -27,7 +28,7 @@ ALIKE_SUN = np.cos(np.radians(30.0))  # images lit from farther apart look diffe
 LEAST_SHARED = 64  # posts along each side of the overlap of two images
 
 
-def tie_images(states, settings):
+def tie_images(states, settings, progress=silent):
     """Match images with each other, and adjust all cameras together.
 
     Parameters
@@ -35,10 +36,11 @@ def tie_images(states, settings):
     states : list of Registration
         Changed in place.
     settings : RegistrationSettings
+    progress : callable
     """
     pairs = [pair for pair in combinations(range(len(states)), 2) if _are_alike(states, pair)]
     for find in (_match_overlap, _match_patches, _match_patches):
-        found = [(pair, find(states, pair, settings)) for pair in pairs]
+        found = [(pair, find(states, pair, settings)) for pair in progress(pairs, "image pairs")]
         pairs = [pair for pair, matches in found if matches is not None]
         if not pairs:
             return

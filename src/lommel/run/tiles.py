@@ -15,6 +15,7 @@ import numpy as np
 
 from lommel.errors import LommelError
 from lommel.estimate.priors import Priors
+from lommel.progress import silent
 from lommel.run.inputs import GridSettings
 from lommel.run.products import RunRecord, peak_memory_mb
 from lommel.run.tiles_engines import check_engine, solve_all
@@ -53,7 +54,7 @@ ARRAYS = [
 
 
 def run_tiles(
-    files, settled, lost, folder, output, settings, grid_settings, tiling=None, progress=iter
+    files, settled, lost, folder, output, settings, grid_settings, tiling=None, progress=silent
 ):
     """Refine a DEM tile by tile and write the products.
 
@@ -71,7 +72,7 @@ def run_tiles(
     grid_settings : GridSettings or None
     tiling : Tiling, optional
     progress : callable
-        Wraps the iterables of images and of tiles.
+        Shows how far each step is; see `lommel.progress.silent`.
 
     Returns
     -------
@@ -80,7 +81,7 @@ def run_tiles(
     tiling = tiling or Tiling()
     check_engine(tiling)
     work = work_folder(output)
-    run = describe_run(files, settled, lost, output, settings, grid_settings, tiling)
+    run = describe_run(files, settled, lost, output, settings, grid_settings, tiling, progress)
     record = RunRecord("sfs", dict(run.asked), list(run.inputs))
     with record.stage("prepare"):
         clear_partial(work)
@@ -88,18 +89,18 @@ def run_tiles(
     with record.stage("tiles"):
         solve_tiles(work, run.plan.tiles, tiling, progress)
     with record.stage("write"), disk_errors(folder):
-        finish_products(run, work, folder, record, load_known(work))
+        finish_products(run, work, folder, record, load_known(work), progress)
     record.write(folder)
     remove_work(work)
     return record.results
 
 
-def describe_run(files, settled, lost, output, settings, grid_settings, tiling):
+def describe_run(files, settled, lost, output, settings, grid_settings, tiling, progress=silent):
     """All that decides what the tiles of a run hold.
 
     Parameters
     ----------
-    files, settled, lost, output, settings, grid_settings, tiling
+    files, settled, lost, output, settings, grid_settings, tiling, progress
         As of `run_tiles`.
 
     Returns
@@ -108,7 +109,8 @@ def describe_run(files, settled, lost, output, settings, grid_settings, tiling):
     """
     record = RunRecord("sfs", asdict(settings) | {"grid": asdict(grid_settings or GridSettings())})
     tables = (files.sun_positions, files.spacecraft_positions, settings.albedo, settings.exposures)
-    record.add_inputs([*files.images, *files.dems, *files.cameras, *filter(None, tables)])
+    inputs = [*files.images, *files.dems, *files.cameras, *filter(None, tables)]
+    record.add_inputs(inputs, progress)
     plan = plan_tiles(settled, grid_settings, tiling, output)
     return TiledRun(
         _absolute(settled),
@@ -126,7 +128,7 @@ def describe_run(files, settled, lost, output, settings, grid_settings, tiling):
     )
 
 
-def prepare(run, work, progress=iter):
+def prepare(run, work, progress=silent):
     """Keep what the run is, and solve the whole scene coarsely unless that is done already.
 
     Parameters
@@ -148,7 +150,7 @@ def prepare(run, work, progress=iter):
         _save_known(work / "scene", known, solution, [*run.lost, *skipped], run.digest)
 
 
-def solve_tiles(work, tiles, tiling, progress=iter):
+def solve_tiles(work, tiles, tiling, progress=silent):
     """Solve tiles of a prepared run; those that are done stay as they are.
 
     Parameters
@@ -158,7 +160,9 @@ def solve_tiles(work, tiles, tiling, progress=iter):
     tiling : Tiling
     progress : callable
     """
-    failed = solve_all(solve_part, work, [tile.number for tile in tiles], tiling, progress)
+    run, numbers = load_run(work), [tile.number for tile in tiles]
+    left = [n for n in numbers if not is_done(part_folder(work, n), run.digest)]
+    failed = solve_all(solve_part, work, left, tiling, progress)
     if failed:
         raise LommelError(
             f"{len(failed)} of {len(tiles)} tiles failed, also when tried again:\n"

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from lommel.errors import InputError, LommelError
+from lommel.progress import silent
 from lommel.run.inputs import GridSettings
 from lommel.run.products import RunRecord, output_folder
 from lommel.run.tiles import describe_run, load_known, prepare, solve_tiles
@@ -70,7 +71,7 @@ def read_share(text):
     return share
 
 
-def prepare_array(files, output, settings, grid_settings, tiling, progress=iter):
+def prepare_array(files, output, settings, grid_settings, tiling, progress=silent):
     """Solve the whole scene coarsely, and keep what the shares have to know.
 
     Parameters
@@ -92,7 +93,7 @@ def prepare_array(files, output, settings, grid_settings, tiling, progress=iter)
             "--register goes not with --tiles: every share would register anew. Run `lommel "
             "register` first and give the cameras it writes with --cameras."
         )
-    run = describe_run(files, files, [], output, settings, grid_settings, tiling)
+    run = describe_run(files, files, [], output, settings, grid_settings, tiling, progress)
     if not run.plan.is_tiled:
         raise InputError(
             "The scene fits in memory in one piece, so there is nothing to share. Leave --tiles "
@@ -102,7 +103,7 @@ def prepare_array(files, output, settings, grid_settings, tiling, progress=iter)
     return len(run.plan.tiles)
 
 
-def solve_share(files, output, settings, grid_settings, tiling, share, progress=iter):
+def solve_share(files, output, settings, grid_settings, tiling, share, progress=silent):
     """Solve every so manieth tile of a scene that is prepared.
 
     Parameters
@@ -133,7 +134,7 @@ def solve_share(files, output, settings, grid_settings, tiling, share, progress=
     return len(tiles)
 
 
-def merge_tiles(output, overwrite=False):
+def merge_tiles(output, overwrite=False, progress=silent):
     """Blend the tiles of all shares into products.
 
     Parameters
@@ -141,6 +142,7 @@ def merge_tiles(output, overwrite=False):
     output : path
         Folder that appears when the products are written; the tiles beside it go.
     overwrite : bool
+    progress : callable
 
     Returns
     -------
@@ -165,7 +167,7 @@ def merge_tiles(output, overwrite=False):
     record = RunRecord("sfs", dict(run.asked), list(run.inputs))
     with output_folder(output, overwrite) as folder:
         with record.stage("write"), disk_errors(folder):
-            finish_products(run, work, folder, record, load_known(work))
+            finish_products(run, work, folder, record, load_known(work), progress)
         record.write(folder)
     remove_work(work)
     return record.results

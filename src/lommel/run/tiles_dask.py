@@ -48,6 +48,8 @@ def submitted(solve, work, numbers, tiling):
     results : list of function ()
         Each waits for its tile and gives what ``solve`` gives. `LommelError` when the scheduler is
         lost.
+    workers : int
+        How many there are now.
     """
     with _cluster(tiling) as cluster, _client(cluster) as client:
         client.register_plugin(OneTileAtATime())
@@ -64,7 +66,8 @@ def submitted(solve, work, numbers, tiling):
             )
             for number in numbers
         ]
-        yield [partial(_result, client, future, work) for future in futures]
+        results = [partial(_result, client, future, work) for future in futures]
+        yield results, max(len(client.nthreads()), 1)
 
 
 def check_scheduler(address):

@@ -11,6 +11,7 @@ from functools import partial
 from multiprocessing import get_context
 
 from lommel.errors import InputError, LommelError
+from lommel.progress import silent
 from lommel.run.tiles_plan import cores
 
 
@@ -25,7 +26,7 @@ def check_engine(tiling):
         _dask_module().check_scheduler(tiling.scheduler)
 
 
-def solve_all(solve, work, numbers, tiling, progress=iter):
+def solve_all(solve, work, numbers, tiling, progress=silent):
     """Solve tiles; those that fail are tried once more.
 
     Rounds go on while they finish tiles: a worker that dies takes others' tiles along.
@@ -39,7 +40,7 @@ def solve_all(solve, work, numbers, tiling, progress=iter):
     numbers : list of int
     tiling : Tiling
     progress : callable
-        Wraps the iterable of tiles.
+        Shows how far each step is; see `lommel.progress.silent`.
 
     Returns
     -------
@@ -50,8 +51,9 @@ def solve_all(solve, work, numbers, tiling, progress=iter):
     pending, failed, finished, attempts = list(numbers), {}, 0, 0
     while pending and (attempts < 2 or finished):
         failed = {}
-        with engine(solve, work, pending, tiling) as results:
-            for number, result in progress(list(zip(pending, results, strict=True))):
+        with engine(solve, work, pending, tiling) as (results, workers):
+            tiles = list(zip(pending, results, strict=True))
+            for number, result in progress(tiles, "tiles", at_once=workers):
                 try:
                     reason = result()
                 except LommelError:
@@ -66,7 +68,7 @@ def solve_all(solve, work, numbers, tiling, progress=iter):
 
 @contextmanager
 def _serial(solve, work, numbers, tiling):
-    yield [partial(solve, work, number) for number in numbers]
+    yield [partial(solve, work, number) for number in numbers], 1
 
 
 @contextmanager
@@ -76,7 +78,8 @@ def _processes(solve, work, numbers, tiling):
     os.environ["NUMBA_NUM_THREADS"] = str(max(cores() // tiling.workers, 1))
     try:
         with ProcessPoolExecutor(tiling.workers, get_context("spawn")) as pool:
-            yield [pool.submit(solve, work, number).result for number in numbers]
+            futures = [pool.submit(solve, work, number) for number in numbers]
+            yield [future.result for future in futures], tiling.workers
     finally:
         if before is None:
             del os.environ["NUMBA_NUM_THREADS"]
@@ -86,8 +89,8 @@ def _processes(solve, work, numbers, tiling):
 
 @contextmanager
 def _dask(solve, work, numbers, tiling):
-    with _dask_module().submitted(solve, work, numbers, tiling) as results:
-        yield results
+    with _dask_module().submitted(solve, work, numbers, tiling) as submitted:
+        yield submitted
 
 
 def _dask_module():

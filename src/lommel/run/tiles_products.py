@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from lommel.io.raster import raster_writer
+from lommel.progress import silent, step
 from lommel.run.inputs import Skipped
 from lommel.run.shape_from_shading import cell_grid, write_exposures
 from lommel.run.tiles_plan import blend_weights
@@ -47,7 +48,7 @@ def size_on_disk(tile, shape):
     return np.dtype(np.float32).itemsize * len(PRODUCTS) * window.rows * window.cols
 
 
-def finish_products(run, work, folder, record, known):
+def finish_products(run, work, folder, record, known, progress=silent):
     """Write rasters and ``exposures.csv`` from the tiles, and fill in the record of the run.
 
     Parameters
@@ -60,12 +61,14 @@ def finish_products(run, work, folder, record, known):
         That the products are written to.
     record : RunRecord
     known : Known
+    progress : callable
     """
     scene = read_record(work / "scene")
     tiles = [read_record(part_folder(work, tile.number)) for tile in run.plan.tiles]
     record.add_skipped([Skipped(**skip) for skip in scene["skipped"]])
-    correction = settle_tiles(run, work, known.correction.shape)
-    sums = _write_products(folder, run.grid, run.plan, work, correction)
+    with step(progress, "long waves"):
+        correction = settle_tiles(run, work, known.correction.shape)
+    sums = _write_products(folder, run.grid, run.plan, work, correction, progress)
     fit = SimpleNamespace(
         exposures=known.exposures, hazes=known.hazes, misfits=_misfits(known.names, tiles)
     )
@@ -79,14 +82,15 @@ def finish_products(run, work, folder, record, known):
     ]
 
 
-def _write_products(folder, grid, plan, work, correction):
+def _write_products(folder, grid, plan, work, correction, progress):
     """Blend the tiles into rasters, several at a time; root mean squares for the results."""
 
     def write(name):
         return _write_product(name, folder, grid, plan, work, correction)
 
     with ThreadPoolExecutor(AT_ONCE) as threads:
-        return dict(zip(PRODUCTS, threads.map(write, PRODUCTS), strict=True))
+        values = progress(threads.map(write, PRODUCTS), "products", len(PRODUCTS), AT_ONCE)
+        return dict(zip(PRODUCTS, values, strict=True))
 
 
 def _write_product(name, folder, grid, plan, work, correction):

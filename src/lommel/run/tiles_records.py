@@ -143,12 +143,30 @@ def save_part(folder, arrays, record):
     record : dict
         With ``digest``.
     """
+    with new_part(folder, record) as partial:
+        for name, values in arrays.items():
+            np.save(partial / f"{name}.npy", values, allow_pickle=False)
+
+
+@contextmanager
+def new_part(folder, record):
+    """The same for what the block writes into the folder that it is given.
+
+    Parameters
+    ----------
+    folder : Path
+    record : dict
+        With ``digest``.
+
+    Yields
+    ------
+    partial : Path
+    """
     partial = folder.with_name(f".{folder.name}.{_me()}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     try:
-        for name, values in arrays.items():
-            np.save(partial / f"{name}.npy", values, allow_pickle=False)
+        yield partial
         (partial / "record.json").write_text(json.dumps(record, default=_plain), encoding="utf-8")
         shutil.rmtree(folder, ignore_errors=True)
         try:

@@ -19,6 +19,7 @@ from lommel.estimate.measured_posts import measured_posts
 from lommel.estimate.priors import Priors
 from lommel.estimate.shape_from_shading import Start, correlation, solve_surface
 from lommel.estimate.surface import Surface
+from lommel.progress import silent, step
 from lommel.run.inputs import known_heights
 from lommel.run.photometry import read_known
 from lommel.run.shape_from_shading import cell_grid, hillshade, seen_posts
@@ -79,7 +80,7 @@ class Known:
         return Surface(grid, self.base_height, self.position if parametrisation == "ray" else None)
 
 
-def prepare_scene(files, grid, stride, settings, progress=iter):
+def prepare_scene(files, grid, stride, settings, progress=silent):
     """Photometry, priors and long waves of the whole scene.
 
     Parameters
@@ -103,7 +104,7 @@ def prepare_scene(files, grid, stride, settings, progress=iter):
     scene = read_views(files, coarse, settings.masks, progress=progress)
     names = [view.name for view in scene.views]
     files = named_files(files, names)
-    samples = _samples(files, grid, settings, scene.thresholds)
+    samples = _samples(files, grid, settings, scene.thresholds, progress)
     priors = samples[0][1].priors
     initial = fill_holes(scene.heights)
     first = scene.views[0]
@@ -116,16 +117,17 @@ def prepare_scene(files, grid, stride, settings, progress=iter):
     share = np.nanmedian(noise / brightness)
     noise = np.where(fallback, share * brightness, noise)
     albedo, photometry = read_known(settings.albedo, settings.exposures, cell_grid(coarse), names)
-    solution = solve_surface(
-        surface,
-        start,
-        scene.views,
-        reflectance_model(settings.reflectance),
-        coarse_priors(replace(priors, noise=noise), stride),
-        settings.solver,
-        albedo,
-        photometry,
-    )
+    with step(progress, "coarse grid"):
+        solution = solve_surface(
+            surface,
+            start,
+            scene.views,
+            reflectance_model(settings.reflectance),
+            coarse_priors(replace(priors, noise=noise), stride),
+            settings.solver,
+            albedo,
+            photometry,
+        )
     value = solution.value
     ratio = np.nanmedian(exposures / value.exposures)
     known = Known(
@@ -154,7 +156,7 @@ def named_files(files, names):
     return replace(files, images=tuple(files.images[k] for k in kept), cameras=cameras)
 
 
-def _samples(files, grid, settings, thresholds):
+def _samples(files, grid, settings, thresholds, progress):
     """Names and solution of each window at full resolution, the scene's middle first.
 
     Its priors hold for the next ones, as they will for the tiles; only an image that no window
@@ -162,7 +164,7 @@ def _samples(files, grid, settings, thresholds):
     """
     windows = _sample_windows(grid.shape)
     found, interpolated, noise = [], 0, {}
-    for window in windows:
+    for window in progress(windows, "windows"):
         part = grid.cut(window)
         try:
             scene = read_views(files, part, settings.masks, thresholds=thresholds)

@@ -12,6 +12,7 @@ from lommel.errors import GeometryError, InputError, LommelError
 from lommel.io.cameras import find_camera, read_camera
 from lommel.io.positions import find_position, read_positions
 from lommel.io.raster import raster_info, read_grid, read_pixels
+from lommel.progress import silent
 from lommel.run.inputs import (
     DEM_IS_FINE_ENOUGH,
     GridSettings,
@@ -62,7 +63,7 @@ class ViewedTerrain:
     thresholds: dict[str, float]
 
 
-def read_views(files, grid_settings=None, masks=None, body=MOON, progress=iter, thresholds=None):
+def read_views(files, grid_settings=None, masks=None, body=MOON, progress=silent, thresholds=None):
     """Terrain and images for shape from shading.
 
     Parameters
@@ -73,7 +74,7 @@ def read_views(files, grid_settings=None, masks=None, body=MOON, progress=iter, 
     masks : MaskSettings, optional
     body : Body
     progress : callable
-        Wraps the iterable of images, as ``rich.progress.track`` does.
+        Shows how far each step is; see `lommel.progress.silent`.
     thresholds : dict of str to float, image units, optional
         Shadow thresholds found on the whole scene, of which the grid is a part: of raw images
         only what falls on it is read, and one that cannot be read any more is an error.
@@ -101,7 +102,7 @@ def read_views(files, grid_settings=None, masks=None, body=MOON, progress=iter, 
         grid = _terrain_grid(files.dems, cameras, grid_settings, body)
         heights = read_heights(files.dems, grid, body)
     suns = _sun_table(files, body) if cameras else None
-    for path in progress(list(cameras)) if cameras else ():
+    for path in progress(list(cameras), "images") if cameras else ():
         try:
             views.append(
                 _camera_view(path, cameras[path], suns, files, grid, heights, body, is_part)

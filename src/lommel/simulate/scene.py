@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from lommel.core.reflectance import reflectance_model
 from lommel.errors import InputError
+from lommel.progress import silent
 from lommel.scene.camera import Camera
 from lommel.scene.geometry import Observation
 from lommel.scene.grid import Grid, Window
@@ -70,14 +71,14 @@ class Scene:
     images: tuple[SimulatedImage, ...]
 
 
-def simulate_scene(settings, progress=iter):
+def simulate_scene(settings, progress=silent):
     """Ground, initial DEM and images of a scene.
 
     Parameters
     ----------
     settings : SceneSettings
     progress : callable
-        Wraps the iterable of frames, as ``rich.progress.track`` does.
+        Shows how far each step is; see `lommel.progress.silent`.
 
     Returns
     -------
@@ -110,7 +111,7 @@ def _take_images(settings, surface, inside, initial, progress):
     suns = [sun_position(sun) for sun in settings.suns]
     lit = [lit_share(surface, sun) for sun in suns]
     images = []
-    for revolution, frame in progress(list(np.ndindex(len(suns), len(cameras)))):
+    for revolution, frame in progress(list(np.ndindex(len(suns), len(cameras))), "frames"):
         camera, sun = cameras[frame], suns[revolution]
         window, is_seen = seen_window(camera, posts)
         if window.is_empty:

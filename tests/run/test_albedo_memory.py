@@ -1,0 +1,196 @@
+"""The memory that `lommel albedo` keeps to, and runs that are broken off and go on."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lommel.errors import InputError, LommelError
+from lommel.estimate import albedo_samples
+from lommel.run import albedo_plan, albedo_records, mixed_scene
+from lommel.run.albedo import run_albedo
+from lommel.run.albedo_plan import plan_albedo
+from lommel.run.albedo_records import work_folder
+from lommel.run.mixed_scene import Place, PlacedScene, place_scene
+from lommel.scene.grid import Window, grid_from_bounds, read_crs
+
+from .albedo_scene import few_steps, files_of
+
+PRODUCTS = ("albedo.tif", "orthomosaic.tif", "count.tif", "residual.tif", "exposures.csv")
+
+
+@pytest.fixture(autouse=True)
+def small_parts(monkeypatch):
+    """Parts so small that the strip has many; images wait on the disk."""
+    monkeypatch.setattr(albedo_plan, "HELD_BYTES", 0)
+    monkeypatch.setattr(albedo_samples, "PIXELS_AT_ONCE", 1000)
+    monkeypatch.setattr(mixed_scene, "POSTS_AT_ONCE", 300)
+
+
+def content(folder):
+    return {name: (folder / name).read_bytes() for name in PRODUCTS}
+
+
+@pytest.fixture
+def unbroken(ground, tmp_path):
+    run_albedo(files_of(ground), tmp_path / "unbroken", few_steps())
+    return content(tmp_path / "unbroken")
+
+
+class Steps(list):
+    """Notes the names of steps and how many parts of each were done."""
+
+    def __call__(self, items, name, total=None, at_once=1):
+        self.append(name)
+        return items
+
+
+def test_memory_does_not_change_the_products(ground, tmp_path, monkeypatch, unbroken):
+    plans = []
+    original = albedo_plan.AlbedoPlan.limits
+    monkeypatch.setattr(
+        albedo_plan.AlbedoPlan, "limits", lambda plan: plans.append(plan) or original(plan)
+    )
+    monkeypatch.setattr(albedo_plan, "SAMPLE", 24e4)  # as if a pixel took so much
+    for name, size in (("little", 0.57e9), ("some", 1e9), ("all", 1e12)):
+        if name == "all":
+            monkeypatch.setattr(albedo_plan, "HELD_BYTES", 2**26)
+        run_albedo(files_of(ground), tmp_path / name, few_steps(), memory=size)
+        assert content(tmp_path / name) == unbroken
+        assert not work_folder(tmp_path / name).exists()
+    assert [plan.waits_on_disk for plan in plans] == [True, True, False]
+    little, some, everything = (plan.kept_pixels for plan in plans)
+    assert little < 100 < some < everything == plans[-1].pixels
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from lommel.run import albedo_plan, mixed_scene
+from lommel.estimate import albedo_samples
+from lommel.run.albedo import run_albedo
+sys.path.insert(0, sys.argv[1])
+from albedo_scene import files_of, few_steps
+from lommel.run.simulate import SceneFolder
+
+albedo_plan.HELD_BYTES, albedo_samples.PIXELS_AT_ONCE, mixed_scene.POSTS_AT_ONCE = 0, 1000, 300
+
+def progress(items, name, total=None, at_once=1):
+    for number, item in enumerate(items):
+        if (name, number) == (sys.argv[4], 3):
+            os.kill(os.getpid(), signal.SIGKILL)
+        yield item
+
+files = files_of(SceneFolder(Path(sys.argv[2])))
+run_albedo(files, sys.argv[3], few_steps(), progress=progress)
+"""
+
+
+def kill_within(ground, output, step):
+    here = os.path.dirname(__file__)
+    command = [sys.executable, "-c", KILLED, here, str(ground.folder), str(output), step]
+    assert subprocess.run(command).returncode == -signal.SIGKILL
+
+
+def test_killed_run_goes_on_where_it_was(ground, tmp_path, unbroken):
+    """Killed while images are read, then while maps are written, then with other settings."""
+    output = tmp_path / "out"
+    kill_within(ground, output, "images")
+    kept = {path.name for path in work_folder(output).glob("[!.]*")}
+    assert kept == {"heights", "image-00000", "image-00001", "image-00002"}
+    written = {name: (work_folder(output) / name / "rows").stat().st_mtime_ns for name in kept}
+    kill_within(ground, output, "maps, block")
+    assert {
+        name: (work_folder(output) / name / "rows").stat().st_mtime_ns for name in kept
+    } == written
+    steps = Steps()
+    run_albedo(files_of(ground), output, few_steps(), progress=steps)
+    assert content(output) == unbroken
+    assert "terrain" not in steps and "pass 1, block" not in steps and "maps, block" in steps
+    assert not work_folder(output).exists()
+
+
+def break_off(files, output):
+    """A run that ends when the maps begin."""
+
+    def progress(items, name, total=None, at_once=1):
+        if name == "maps, block":
+            raise KeyboardInterrupt
+        return items
+
+    with pytest.raises(KeyboardInterrupt):
+        run_albedo(files, output, few_steps(), progress=progress)
+    assert (work_folder(output) / "photometry").is_dir() and not output.exists()
+
+
+@pytest.mark.parametrize("change", ["settings", "inputs"])
+def test_other_settings_or_inputs_begin_anew(ground, tmp_path, change):
+    output, files, settings = tmp_path / "out", files_of(ground), few_steps()
+    break_off(files, output)
+    if change == "settings":
+        settings = replace(settings, haze=False)
+    else:
+        files = files_of(ground, ground.images[:-1])
+    steps = Steps()
+    run_albedo(files, output, settings, progress=steps)
+    assert {"terrain", "pass 1, block", "maps, block"} <= set(steps)
+    run_albedo(files, tmp_path / "fresh", settings)
+    assert content(output) == content(tmp_path / "fresh")
+
+
+def test_photometry_comes_back_to_the_last_bit(ground, tmp_path, monkeypatch):
+    found = []
+    original = albedo_records.Kept.photometry
+
+    def twice(kept, compute):
+        found.extend([original(kept, compute), original(kept, None)])
+        return found[1]
+
+    monkeypatch.setattr(albedo_records.Kept, "photometry", twice)
+    run_albedo(files_of(ground), tmp_path / "out", few_steps())
+    fresh, read = (dict(vars(photometry)) for photometry in found)
+    for one, other in zip(fresh.pop("state"), read.pop("state"), strict=True):
+        np.testing.assert_array_equal(one, other)
+    for name in ("errors", "shared_errors"):
+        np.testing.assert_array_equal(fresh.pop(name), read.pop(name))
+    assert fresh == read
+
+
+def test_disk_without_room_is_told_before_images_are_read(ground, tmp_path, monkeypatch):
+    monkeypatch.setattr(albedo_plan, "DISK_PER_POST", 1e15)
+    steps = Steps()
+    with pytest.raises(LommelError, match=r"\.albedo has \d.* MB free, \d.* MB are needed"):
+        run_albedo(files_of(ground), tmp_path / "out", few_steps(), progress=steps)
+    assert "images" not in steps
+
+
+def test_least_memory_is_named_and_is_enough(ground):
+    placed = place_scene(files_of(ground))
+    with pytest.raises(InputError, match=r"--memory 0\.00 GB is too little.* need ") as error:
+        plan_albedo(placed, few_steps(), 1e6)
+    least = 1e9 * float(re.search(r"need ([0-9.]+) GB", str(error.value))[1])
+    assert plan_albedo(placed, few_steps(), least).memory <= least
+
+
+@pytest.mark.parametrize("side", [10_000, 30_000])
+def test_least_memory_does_not_grow_with_the_scene(side, monkeypatch):
+    """Frames of 10 000 posts, four at every post: 400 million pixels or ten times as many."""
+    monkeypatch.undo()
+    grid = grid_from_bounds(
+        (0.0, 0.0, 10.0 * side, 10.0 * side),
+        10.0,
+        read_crs("+proj=eqc +R=1737400 +units=m +type=crs"),
+    )
+    starts = range(0, side, 10_000)
+    windows = [Window(row, col, 10_000, 10_000) for row in starts for col in starts]
+    places = [Place("image", window) for window in windows for _ in range(4)]
+    placed = PlacedScene(grid, None, places, [], [])
+    plan = plan_albedo(placed, few_steps(), 1e9)
+    assert plan.memory <= 1e9 and plan.waits_on_disk and plan.passes == 4
+    assert plan.pixels == 4 * side**2 and plan.kept_pixels < 1e8
+    assert "memory   1.00 GB" in str(plan) and "images   " in str(plan)
