@@ -41,7 +41,7 @@ class Scene:
     posts : int
         Along each side of the DEM.
     images : int
-        1 to 4.
+        As many as there are Suns and cameras, at most.
     seed : int
     spacing : float, m
     hurst : float
@@ -63,6 +63,8 @@ class Scene:
     initial_blur : float, posts
         Of the initial DEM against the true one.
     initial_noise : float, m
+    suns_deg, cameras_deg : tuple of (float, float)
+        Azimuth and elevation of the Suns; azimuth and off-nadir angle of the cameras.
     """
 
     posts: int = 500
@@ -79,6 +81,8 @@ class Scene:
     noise: float = 0.005
     initial_blur: float = 6.0
     initial_noise: float = 1.0
+    suns_deg: tuple = SUNS_DEG
+    cameras_deg: tuple = CAMERAS_DEG
 
 
 def make_scene(scene, folder):
@@ -149,8 +153,8 @@ def _take_images(scene, rng, heights, albedo, ground, folder):
     image = np.empty((samples, samples), np.float32)
     suns = []
     for number in range(1, scene.images + 1):
-        sun = SUN_DISTANCE * direction(*SUNS_DEG[number - 1])
-        camera, axes = pinhole(*CAMERAS_DEG[number - 1])
+        sun = SUN_DISTANCE * direction(*scene.suns_deg[number - 1])
+        camera, axes = pinhole(*scene.cameras_deg[number - 1])
         facet_brightness(heights, albedo, origin, spacing, radius, sun, camera, brightness)
         place = origin, spacing, radius, camera, axes, FOCAL_LENGTH
         pinhole_image(heights, brightness, *place, image, 0, samples)

@@ -221,6 +221,12 @@ def sfs(
     ] = None,
     max_steps: Annotated[int, typer.Option(min=1, help="Gauss-Newton steps on the full grid.")] = 8,
     registers: Registers = False,
+    all_images: Annotated[
+        bool,
+        typer.Option(
+            "--all-images", help="Use all images. Default: of more than 8, the best few per place."
+        ),
+    ] = False,
     reflectance: Reflectance = "lunar-lambert",
     shadow_threshold: ShadowThreshold = None,
     spacing: Spacing = None,
@@ -260,6 +266,7 @@ def sfs(
     """Refine a DEM by shape from shading (photoclinometry) in one or more images."""
     from lommel.estimate.priors import PriorSettings
     from lommel.estimate.shape_from_shading import SolverSettings
+    from lommel.run.selection import survey_images
     from lommel.run.shape_from_shading import SfsSettings, run_shape_from_shading
     from lommel.run.tiles_plan import Tiling, plan_tiles, read_memory
     from lommel.scene.masks import MaskSettings
@@ -282,6 +289,7 @@ def sfs(
         albedo=None if albedo is None else str(albedo),
         exposures=None if exposures is None else str(exposures),
         registers=registers,
+        all_images=all_images,
     )
     files = _files(images, dem, sun_positions, spacecraft_positions, positions_unit, cameras)
     grid = _grid(spacing, crs, bounds)
@@ -289,7 +297,8 @@ def sfs(
         None if memory is None else read_memory(memory), engine, scheduler=dask_scheduler
     )
     if dry_run:
-        typer.echo(plan_tiles(files, grid, tiling, output))
+        footprints = survey_images(files, grid, settings, output)
+        typer.echo(plan_tiles(footprints, tiling, output))
         return
     if tiles is not None:
         _solve_share(tiles, files, output, settings, grid, tiling)
@@ -571,6 +580,9 @@ def _finish(output, draws_report=True):
     record = json.loads((output / "run.json").read_text(encoding="utf-8"))
     for skip in record["skipped"]:
         log.print(f"[yellow]left out[/] {escape(skip['reason'])}", soft_wrap=True)
+    if record["not_chosen"]:
+        count = len(record["not_chosen"])
+        log.print(f"not chosen {count} images: exposures.csv tells why", soft_wrap=True)
     log.print(escape(record["outcome"]["sentence"]), soft_wrap=True)
     for name, value in record["results"].items():
         log.print(

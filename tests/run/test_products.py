@@ -163,7 +163,7 @@ def test_record_is_plain_json_with_every_key(tmp_path):
     found = json.loads((tmp_path / "run.json").read_text(), parse_constant=refuse)
     assert set(found) == {
         *("lommel", "created", "command", "settings", "inputs", "stages", "skipped", "results"),
-        *("history", "outcome", "targets", "versions", "machine"),
+        *("history", "outcome", "targets", "versions", "machine", "not_chosen"),
     }
     assert found["settings"] == {"spacing": 2.5, "path": str(data), "bounds": [0, 1], "max": None}
     assert found["results"] == {"rmse_m": None, "images": 3}

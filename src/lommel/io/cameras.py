@@ -10,7 +10,7 @@ from lommel.errors import InputError, LommelError
 SUFFIXES = (".json", ".isd", ".tsai")
 
 
-def find_camera(image):
+def find_camera(image, may_have_label=True):
     """Path of the file that holds an image's camera, or None.
 
     Parameters
@@ -18,6 +18,8 @@ def find_camera(image):
     image : Path
         ``frame.tif`` has its camera in ``frame.json`` or ``frame.isd`` (ISD), ``frame.tsai``, or,
         when none of these exists, in its own ISIS label.
+    may_have_label : bool
+        False when it is known to have none, which spares a look.
 
     Returns
     -------
@@ -28,6 +30,8 @@ def find_camera(image):
         path = image.with_suffix(suffix)
         if path != image and path.exists() and (suffix != ".json" or _is_isd(path)):
             return path
+    if not may_have_label:
+        return None
     from lommel.io.isis import has_camera
 
     try:

@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -47,6 +48,8 @@ COG = {
 }
 SCRATCH_ROWS = 128  # of these tiles while they are written: rows of all of them are in memory
 CACHE_MB = 128  # of blocks that GDAL holds; its default is a share of the machine
+ISIS_LABEL = "json:ISIS3"  # GDAL's domain of metadata that holds it
+FILES_AT_ONCE = 8  # whose headers are read side by side: a shared disk answers after milliseconds
 MARGIN = 4  # pixels read around a window so that interpolation sees its neighbours
 
 if "GDAL_CACHEMAX" not in os.environ:
@@ -68,6 +71,8 @@ class RasterInfo:
     nodata : float or None
     has_mask_band : bool
         The second band is an 8-bit mask or alpha, not data.
+    has_label : bool
+        An ISIS label, which may tell of a camera.
     grid : Grid or None
         None when the raster carries no CRS or no transform.
     """
@@ -78,6 +83,7 @@ class RasterInfo:
     dtype: str
     nodata: float | None
     has_mask_band: bool
+    has_label: bool
     grid: Grid | None
 
     @property
@@ -117,6 +123,7 @@ def raster_info(path, body=MOON):
             dtype=file.dtypes[0],
             nodata=file.nodata,
             has_mask_band=_has_mask_band(file),
+            has_label=bool(file.tags(ns=ISIS_LABEL)),
             grid=_grid_of(file, path, body),
         )
 
@@ -134,7 +141,7 @@ def read_isis_label(path):
         As in GDAL's metadata domain ``json:ISIS3``; None when the raster has no such label.
     """
     with _open(path) as file:
-        items = file.tags(ns="json:ISIS3").items()
+        items = file.tags(ns=ISIS_LABEL).items()
     # rasterio takes a cube's JSON for a line "key: value" and cuts it at its first colon; a
     # GeoTIFF's has a key of its own
     texts = [text if not key.startswith("{") else f"{key}:{text}" for key, text in items]
@@ -147,13 +154,45 @@ def read_isis_label(path):
 
 def read_grid(path, body=MOON):
     """The grid of a map-projected raster; an error when it has no CRS."""
-    grid = raster_info(path, body).grid
-    if grid is None:
+    return grid_of(raster_info(path, body))
+
+
+def grid_of(info):
+    """The grid in a header; an error when it has no CRS."""
+    if info.grid is None:
         raise InputError(
-            f"{path} has no CRS or no transform, so its place is unknown. Assign one with "
+            f"{info.path} has no CRS or no transform, so its place is unknown. Assign one with "
             "gdal_edit.py -a_srs and -a_ullr, or give a map-projected raster."
         )
-    return grid
+    return info.grid
+
+
+def side_by_side(function, paths):
+    """What a function that looks at one raster gives for each of many, in their order.
+
+    Parameters
+    ----------
+    function : function (path)
+        It must not call compiled kernels that use threads of their own.
+    paths : sequence of path
+
+    Returns
+    -------
+    results : list
+    """
+    paths, results = list(paths), {}
+
+    def some(first):
+        # a listing of the folder for each file in it would cost the square of their number
+        with rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="TRUE"):
+            for k in range(first, len(paths), FILES_AT_ONCE):
+                results[k] = function(paths[k])
+
+    with warnings.catch_warnings(), ThreadPoolExecutor(FILES_AT_ONCE) as pool:
+        # here, because threads share the filters that each of them would put back
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        list(pool.map(some, range(FILES_AT_ONCE)))
+    return [results[k] for k in range(len(paths))]
 
 
 def read_pixels(path, window=None):
@@ -185,6 +224,33 @@ def read_pixels(path, window=None):
     return (
         values if (scale, offset) == (1.0, 0.0) else np.float32(scale) * values + np.float32(offset)
     )
+
+
+def read_sketch(path, size, body=MOON):
+    """Which part of a map-projected raster shows something: single pixels of a lattice.
+
+    Parameters
+    ----------
+    path : path
+    size : int, pixels
+        Along each side of the lattice at most.
+    body : Body
+
+    Returns
+    -------
+    grid : Grid
+        Of the raster.
+    shows : bool array (rows, cols)
+        True where the pixel is known and not black.
+    """
+    with _open(path) as file:
+        shape = tuple(min(side, size) for side in file.shape)
+        try:
+            values = file.read(1, out_shape=shape, resampling=Resampling.nearest)
+            known = file.read_masks(1, out_shape=shape) > 0
+        except GDAL_ERRORS as error:
+            raise UnreadableError(f"{path} cannot be read, it may be truncated: {error}") from error
+        return _grid_of(file, path, body), known & (values > 0)
 
 
 def read_image_on_grid(path, grid, body=MOON):

@@ -115,6 +115,8 @@ class RunRecord:
         Name, seconds and peak memory of each stage.
     skipped : list of dict
         Images left out and why.
+    not_chosen : list of dict
+        Images that could be used, but others tell more, and why.
     results : dict of str to number
         Names carry the unit.
     targets : dict of str to str
@@ -130,6 +132,7 @@ class RunRecord:
     inputs: list[dict] = field(default_factory=list)
     stages: list[dict] = field(default_factory=list)
     skipped: list[dict] = field(default_factory=list)
+    not_chosen: list[dict] = field(default_factory=list)
     results: dict = field(default_factory=dict)
     targets: dict = field(default_factory=dict)
     history: list[dict] = field(default_factory=list)
@@ -146,13 +149,26 @@ class RunRecord:
             {"name": name, "seconds": round(seconds, 3), "peak_memory_mb": round(peak, 1)}
         )
 
-    def add_inputs(self, paths, progress=silent):
-        """Note size and digest of input files; files that cannot be read are noted as such."""
-        self.inputs.extend(_digest(Path(path)) for path in progress(paths, "digests of inputs"))
+    def add_inputs(self, paths, progress=silent, unread=()):
+        """Note size and digest of input files; files that cannot be read are noted as such.
+
+        Parameters
+        ----------
+        paths : sequence of path
+        progress : callable
+        unread : collection of path
+            Those among them that are not used: their size is enough, to read them may take hours.
+        """
+        for path in progress(paths, "digests of inputs"):
+            self.inputs.append(_digest(Path(path), path not in unread))
 
     def add_skipped(self, skipped):
         """Note images left out: objects with ``name`` and ``reason``."""
-        self.skipped.extend({"image": skip.name, "reason": skip.reason} for skip in skipped)
+        self.skipped.extend(_named(skipped))
+
+    def add_not_chosen(self, not_chosen):
+        """Note images that were not chosen: objects with ``name`` and ``reason``."""
+        self.not_chosen.extend(_named(not_chosen))
 
     def write(self, folder):
         """Write ``run.json`` into a folder."""
@@ -195,10 +211,16 @@ def _in_degrees(settings):
     return shown
 
 
-def _digest(path):
+def _named(images):
+    return [{"image": one.name, "reason": one.reason} for one in images]
+
+
+def _digest(path, reads):
     try:
-        with open(path, "rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        digest = None
+        if reads:
+            with open(path, "rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
         return {"path": str(path), "bytes": path.stat().st_size, "sha256": digest}
     except OSError as error:
         return {"path": str(path), "bytes": None, "sha256": None, "error": error.strerror}

@@ -24,6 +24,7 @@ from lommel.progress import silent, step
 from lommel.run.inputs import GridSettings, SceneFiles
 from lommel.run.photometry import read_known
 from lommel.run.products import RunRecord, output_folder
+from lommel.run.selection import survey_images
 from lommel.run.tiles_plan import plan_tiles
 from lommel.run.views import read_views
 from lommel.scene.grid import Grid
@@ -53,6 +54,8 @@ class SfsSettings:
         Map and table of an earlier run, held fixed.
     registers : bool
         Register raw images to the DEM first; otherwise they are only checked.
+    all_images : bool
+        Use all images; otherwise, where there are many, the best few of each place.
     """
 
     parametrisation: str = "height"
@@ -63,6 +66,12 @@ class SfsSettings:
     albedo: str | None = None
     exposures: str | None = None
     registers: bool = False
+    all_images: bool = False
+
+    @property
+    def knows_albedo(self):
+        """True when albedo is nothing that the images have to tell."""
+        return self.albedo is not None or not self.solver.estimate_albedo
 
 
 def run_shape_from_shading(
@@ -106,17 +115,29 @@ def run_shape_from_shading(
     with output_folder(output, overwrite) as folder:
         with record.stage("read"):
             settled, lost, remark = _settled(files, folder, settings.registers, progress)
-            if plan_tiles(settled, grid_settings, tiling, output).is_tiled:
+            with step(progress, "footprints"):
+                footprints = survey_images(settled, grid_settings, settings, output)
+            if plan_tiles(footprints, tiling, output).is_tiled:
                 from lommel.run.tiles import run_tiles  # and what it needs to share work
 
                 return run_tiles(
-                    files, settled, lost, folder, output, settings, grid_settings, tiling, progress
+                    files,
+                    footprints,
+                    lost,
+                    folder,
+                    output,
+                    settings,
+                    grid_settings,
+                    tiling,
+                    progress,
                 )
-            scene = read_views(settled, grid_settings, settings.masks, progress=progress)
+            used, grid = footprints.used, footprints.grid
+            scene = read_views(used, grid, settings.masks, progress=progress)
             tables = (files.sun_positions, files.spacecraft_positions)
             inputs = [*files.images, *files.dems, *files.cameras, *filter(None, tables)]
-            record.add_inputs(inputs, progress)
-            record.add_skipped([*lost, *scene.skipped])
+            record.add_inputs(inputs, progress, footprints.unused(files))
+            record.add_skipped([*lost, *footprints.skipped, *scene.skipped])
+            record.add_not_chosen(footprints.not_chosen)
             _refuse_small(scene.grid)
             names = [view.name for view in scene.views]
             cells = cell_grid(scene.grid)
@@ -151,8 +172,8 @@ def run_shape_from_shading(
             refined[~(known | seen)] = np.nan
             residual = relative_residual(solution.value)
             _write_products(folder, scene, initial, refined, solution.value, residual)
-            write_exposures(folder, scene.views, record.skipped, solution.value)
-        record.results = _results(scene, refined, solution.value, residual)
+            write_exposures(folder, scene.views, record, solution.value)
+        record.results = _results(scene, refined, solution.value, residual) | footprints.results
         record.history = solution.history
         record.outcome = {"name": solution.outcome, "sentence": solution.advice + remark}
         record.write(folder)
@@ -304,16 +325,15 @@ def relative_residual(surface):
     return np.sqrt(total / np.where(count > 0, count, np.nan).astype(np.float32))
 
 
-def write_exposures(folder, views, skipped, surface):
-    """Write ``exposures.csv``: a line per image, and the reasons of those left out.
+def write_exposures(folder, views, record, surface):
+    """Write ``exposures.csv``: a line per image, and the reasons of those not used.
 
     Parameters
     ----------
     folder : Path
     views : list
         Of objects with a ``name``.
-    skipped : list of dict
-        Of the run's record.
+    record : RunRecord
     surface : SurfaceSolution
         Or another object with ``exposures``, ``hazes`` and ``misfits``.
     """
@@ -323,7 +343,7 @@ def write_exposures(folder, views, skipped, surface):
         for k, view in enumerate(views):
             exposure, haze = float(surface.exposures[k]), float(surface.hazes[k])
             writer.writerow([view.name, exposure, haze, float(surface.misfits[k]), 1, ""])
-        for skip in skipped:
+        for skip in [*record.skipped, *record.not_chosen]:
             writer.writerow([skip["image"], "", "", "", 0, skip["reason"]])
 
 

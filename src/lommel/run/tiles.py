@@ -37,7 +37,6 @@ from lommel.run.tiles_records import (
     save_run,
 )
 from lommel.run.tiles_solve import Known, prepare_scene, solve_tile
-from lommel.run.views import view_grid
 
 ARRAYS = [
     "exposures",
@@ -54,14 +53,16 @@ ARRAYS = [
 
 
 def run_tiles(
-    files, settled, lost, folder, output, settings, grid_settings, tiling=None, progress=silent
+    files, footprints, lost, folder, output, settings, grid_settings, tiling=None, progress=silent
 ):
     """Refine a DEM tile by tile and write the products.
 
     Parameters
     ----------
-    files, settled : SceneFiles
-        As given, and with registered cameras.
+    files : SceneFiles
+        As given.
+    footprints : Footprints
+        With registered cameras.
     lost : list of Skipped
         Images lost on the way.
     folder : Path
@@ -81,7 +82,7 @@ def run_tiles(
     tiling = tiling or Tiling()
     check_engine(tiling)
     work = work_folder(output)
-    run = describe_run(files, settled, lost, output, settings, grid_settings, tiling, progress)
+    run = describe_run(files, footprints, lost, output, settings, grid_settings, tiling, progress)
     record = RunRecord("sfs", dict(run.asked), list(run.inputs))
     with record.stage("prepare"):
         clear_partial(work)
@@ -95,12 +96,12 @@ def run_tiles(
     return record.results
 
 
-def describe_run(files, settled, lost, output, settings, grid_settings, tiling, progress=silent):
+def describe_run(files, footprints, lost, output, settings, grid_settings, tiling, progress=silent):
     """All that decides what the tiles of a run hold.
 
     Parameters
     ----------
-    files, settled, lost, output, settings, grid_settings, tiling, progress
+    files, footprints, lost, output, settings, grid_settings, tiling, progress
         As of `run_tiles`.
 
     Returns
@@ -110,11 +111,10 @@ def describe_run(files, settled, lost, output, settings, grid_settings, tiling, 
     record = RunRecord("sfs", asdict(settings) | {"grid": asdict(grid_settings or GridSettings())})
     tables = (files.sun_positions, files.spacecraft_positions, settings.albedo, settings.exposures)
     inputs = [*files.images, *files.dems, *files.cameras, *filter(None, tables)]
-    record.add_inputs(inputs, progress)
-    plan = plan_tiles(settled, grid_settings, tiling, output)
+    record.add_inputs(inputs, progress, footprints.unused(files))
+    plan = plan_tiles(footprints, tiling, output)
     return TiledRun(
-        _absolute(settled),
-        view_grid(settled, grid_settings),
+        replace(footprints, files=_absolute(footprints.files)),
         plan,
         replace(
             settings,
@@ -123,8 +123,10 @@ def describe_run(files, settled, lost, output, settings, grid_settings, tiling, 
         ),
         record.settings,
         record.inputs,
-        lost,
-        digest_of([record.settings, record.inputs, asdict(plan) | {"memory": None}]),
+        [*lost, *footprints.skipped],
+        digest_of(
+            [record.settings, record.inputs, asdict(plan) | {"memory": None}, footprints.choice]
+        ),
     )
 
 
@@ -144,7 +146,7 @@ def prepare(run, work, progress=silent):
     if is_done(work / "scene", run.digest):
         return
     known, solution, skipped = prepare_scene(
-        run.files, run.grid, run.plan.stride, run.settings, progress
+        run.footprints, run.plan.stride, run.settings, progress
     )
     with disk_errors(work):
         _save_known(work / "scene", known, solution, [*run.lost, *skipped], run.digest)
@@ -189,7 +191,8 @@ def solve_part(work, number):
             return None
         start, tile = time.perf_counter(), run.plan.tiles[number]
         refuse_full(work, size_on_disk(tile, run.grid.shape))
-        products, record = solve_tile(run.files, run.grid, tile, load_known(work), run.settings)
+        files = run.footprints.within(tile.outer)
+        products, record = solve_tile(files, run.grid, tile, load_known(work), run.settings)
         record |= {
             "digest": run.digest,
             "seconds": round(time.perf_counter() - start, 3),
@@ -241,7 +244,7 @@ def _absolute(files):
     """The same files for workers that stand in another folder."""
 
     def absolute(paths):
-        return tuple(Path(os.path.abspath(path)) for path in paths)
+        return tuple(path and Path(os.path.abspath(path)) for path in paths)
 
     tables = (files.sun_positions, files.spacecraft_positions)
     suns, crafts = (path and Path(os.path.abspath(path)) for path in tables)

@@ -9,9 +9,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from lommel.errors import InputError, LommelError
-from lommel.progress import silent
+from lommel.progress import silent, step
 from lommel.run.inputs import GridSettings
 from lommel.run.products import RunRecord, output_folder
+from lommel.run.selection import survey_images
 from lommel.run.tiles import describe_run, load_known, prepare, solve_tiles
 from lommel.run.tiles_engines import check_engine
 from lommel.run.tiles_plan import work_folder
@@ -93,7 +94,9 @@ def prepare_array(files, output, settings, grid_settings, tiling, progress=silen
             "--register goes not with --tiles: every share would register anew. Run `lommel "
             "register` first and give the cameras it writes with --cameras."
         )
-    run = describe_run(files, files, [], output, settings, grid_settings, tiling, progress)
+    with step(progress, "footprints"):
+        footprints = survey_images(files, grid_settings, settings, output)
+    run = describe_run(files, footprints, [], output, settings, grid_settings, tiling, progress)
     if not run.plan.is_tiled:
         raise InputError(
             "The scene fits in memory in one piece, so there is nothing to share. Leave --tiles "

@@ -14,7 +14,6 @@ import numpy as np
 from affine import Affine
 
 from lommel.errors import InputError
-from lommel.run.views import view_grid
 from lommel.scene.grid import Grid, Window
 
 BYTES_PER_POST, BYTES_PER_IMAGE = 200, 16  # measured: 211 with one image, 235 with four
@@ -152,7 +151,7 @@ class Plan:
         )
 
 
-def make_plan(shape, images, memory, side=None, stride=None):
+def make_plan(shape, images, memory, side=None, stride=None, count=None):
     """Tiles of a scene that stay within memory; one tile when all of it does.
 
     Parameters
@@ -160,12 +159,15 @@ def make_plan(shape, images, memory, side=None, stride=None):
     shape : tuple of int
         Posts of the scene.
     images : int
+        Of the whole scene.
     memory : float, bytes
         Of one process.
     side : int, posts, optional
         Of a tile without its halo, in place of what follows from memory; a multiple of `STEP`.
     stride : int, posts, optional
         Of the coarse grid, in place of what follows from memory.
+    count : function (window) -> int, optional
+        Images of a window; all of them by default.
 
     Returns
     -------
@@ -177,36 +179,57 @@ def make_plan(shape, images, memory, side=None, stride=None):
     if side is None and rows * cols <= posts:
         whole = Window(0, 0, rows, cols)
         return Plan(shape, images, 1, (Tile(0, whole, whole),), AT_REST + rows * cols * per_post)
+    count = count or (lambda window: images)
     if side is None:
-        side = _even_side(shape, int(max(posts, 0) ** 0.5 - 2 * HALO) // STEP * STEP)
-    if side < min(LEAST_SIDE, STEP):
-        least = AT_REST + per_post * (LEAST_SIDE + 2 * HALO) ** 2
-        raise InputError(
-            f"--memory {memory / 1e9:.2f} GB is too little for {images} images: a tile of "
-            f"{LEAST_SIDE} posts needs {least / 1e9:.2f} GB. Give more, or fewer images."
-        )
-    tiles = []
+        side = _largest_side(shape, count, memory)
+    tiles = _tiles(shape, side)
+    needs = [_memory(tile.outer.shape, count(tile.outer)) for tile in tiles]
+    if stride is None:
+        stride = 2
+        posts = max(posts, (max(needs) - AT_REST) / per_post)  # with all images, in a tile's memory
+        while rows * cols / stride**2 > posts:
+            stride *= 2
+    return Plan(shape, images, stride, tuple(tiles), max(needs))
+
+
+def _memory(shape, images):
+    """What solving so many posts takes, bytes."""
+    return AT_REST + (BYTES_PER_POST + BYTES_PER_IMAGE * images) * shape[0] * shape[1]
+
+
+def _largest_side(shape, count, memory):
+    """Side of the fewest tiles that memory has room for, posts."""
+    widest = -(-max(shape) // STEP) * STEP
+    for most_posts in range(widest, 0, -STEP):
+        side = _even_side(shape, most_posts)
+        most = max(count(tile.outer) for tile in _tiles(shape, side))
+        if _memory((side + 2 * HALO,) * 2, most) <= memory:
+            return side
+    raise InputError(
+        f"--memory {memory / 1e9:.2f} GB is too little for {most} images: a tile of {LEAST_SIDE} "
+        f"posts needs {_memory((LEAST_SIDE + 2 * HALO,) * 2, most) / 1e9:.2f} GB. Give more, or "
+        "fewer images."
+    )
+
+
+def _tiles(shape, side):
+    rows, cols = shape
+    tiles: list[Tile] = []
     for row, last_row in _cuts(rows, side):
         for col, last_col in _cuts(cols, side):
             inner = Window(row, col, last_row - row, last_col - col)
             around = Window(row - HALO, col - HALO, inner.rows + 2 * HALO, inner.cols + 2 * HALO)
             outer = around.intersection(Window(0, 0, rows, cols))
             tiles.append(Tile(len(tiles), inner, outer))
-    largest = max(tile.outer.rows * tile.outer.cols for tile in tiles)
-    if stride is None:
-        stride = 2
-        while rows * cols / stride**2 > max(posts, largest):
-            stride *= 2
-    return Plan(shape, images, stride, tuple(tiles), AT_REST + per_post * largest)
+    return tiles
 
 
-def plan_tiles(files, grid_settings, tiling, output):
+def plan_tiles(footprints, tiling, output):
     """The plan of a run; that of an earlier one that was broken off goes on.
 
     Parameters
     ----------
-    files : SceneFiles
-    grid_settings : GridSettings or None
+    footprints : Footprints
     tiling : Tiling or None
     output : path
         Of the run, beside which a broken run has left its tiles.
@@ -216,14 +239,19 @@ def plan_tiles(files, grid_settings, tiling, output):
     plan : Plan
     """
     tiling = tiling or Tiling()
-    side, stride, shape = tiling.side, None, view_grid(files, grid_settings).shape
+    side, stride, shape = tiling.side, None, footprints.grid.shape
     if tiling.memory is None and side is None:
         side, stride = earlier_cut(work_folder(output))
     memory = free_memory() * MEMORY_SHARE if tiling.memory is None else tiling.memory
-    whole = make_plan(shape, len(files.images), memory, side, stride)
+    images = len(footprints.used.images)
+
+    def count(window):
+        return int(footprints.uses(window).sum())
+
+    whole = make_plan(shape, images, memory, side, stride, count)
     if tiling.workers == 1 or not whole.is_tiled:
         return whole
-    return make_plan(shape, len(files.images), memory / tiling.workers, side, stride)
+    return make_plan(shape, images, memory / tiling.workers, side, stride, count)
 
 
 def work_folder(output):
@@ -251,8 +279,6 @@ def cores():
 
 def _even_side(shape, most):
     """The least side that cuts the scene into no more tiles than the largest one does."""
-    if most <= 0:
-        return most
     counts = [-(-size // most) for size in shape]
     least = max(-(-size // count) for size, count in zip(shape, counts, strict=True))
     return -(-least // STEP) * STEP

@@ -66,6 +66,7 @@ def finish_products(run, work, folder, record, known, progress=silent):
     scene = read_record(work / "scene")
     tiles = [read_record(part_folder(work, tile.number)) for tile in run.plan.tiles]
     record.add_skipped([Skipped(**skip) for skip in scene["skipped"]])
+    record.add_not_chosen(run.footprints.not_chosen)
     with step(progress, "long waves"):
         correction = settle_tiles(run, work, known.correction.shape)
     sums = _write_products(folder, run.grid, run.plan, work, correction, progress)
@@ -73,8 +74,8 @@ def finish_products(run, work, folder, record, known, progress=silent):
         exposures=known.exposures, hazes=known.hazes, misfits=_misfits(known.names, tiles)
     )
     views = [SimpleNamespace(name=name) for name in known.names]
-    write_exposures(folder, views, record.skipped, fit)
-    record.results = _results(known, tiles, sums)
+    write_exposures(folder, views, record, fit)
+    record.results = _results(known, tiles, sums) | run.footprints.results
     record.history = scene["history"]
     record.outcome = _outcome(scene, tiles)
     record.settings["tiles"] = [

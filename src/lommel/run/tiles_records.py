@@ -20,10 +20,9 @@ import numpy as np
 
 from lommel import __version__
 from lommel.errors import LommelError
-from lommel.run.inputs import SceneFiles
+from lommel.run.footprints import Footprints
 from lommel.run.shape_from_shading import SfsSettings
 from lommel.run.tiles_plan import Plan
-from lommel.scene.grid import Grid
 
 RUN = "run.pickle"  # pickled, as the folder belongs to the user as compiled code does
 
@@ -34,10 +33,8 @@ class TiledRun:
 
     Attributes
     ----------
-    files : SceneFiles
-        With absolute paths and registered cameras.
-    grid : Grid
-        Of the whole scene.
+    footprints : Footprints
+        Of files with absolute paths and registered cameras.
     plan : Plan
     settings : SfsSettings
     asked : dict
@@ -45,14 +42,13 @@ class TiledRun:
     inputs : list of dict
         Path, bytes and digest of each input file.
     lost : list of Skipped
-        Images that could not be registered.
+        Images that could not be registered, that touch nothing or cannot be read.
     digest : str
     version : str
         Of the program.
     """
 
-    files: SceneFiles
-    grid: Grid
+    footprints: Footprints
     plan: Plan
     settings: SfsSettings
     asked: dict
@@ -60,6 +56,11 @@ class TiledRun:
     lost: list
     digest: str
     version: str = __version__
+
+    @property
+    def grid(self):
+        """Of the whole scene."""
+        return self.footprints.grid
 
 
 def save_run(work, run):

@@ -80,14 +80,13 @@ class Known:
         return Surface(grid, self.base_height, self.position if parametrisation == "ray" else None)
 
 
-def prepare_scene(files, grid, stride, settings, progress=silent):
+def prepare_scene(footprints, stride, settings, progress=silent):
     """Photometry, priors and long waves of the whole scene.
 
     Parameters
     ----------
-    files : SceneFiles
-    grid : Grid
-        Full resolution.
+    footprints : Footprints
+        On the grid of full resolution.
     stride : int
         Posts per post of the coarse grid.
     settings : SfsSettings
@@ -100,11 +99,10 @@ def prepare_scene(files, grid, stride, settings, progress=silent):
         Of the coarse grid.
     skipped : list of Skipped
     """
-    coarse = coarse_grid(grid, stride)
-    scene = read_views(files, coarse, settings.masks, progress=progress)
+    coarse = coarse_grid(footprints.grid, stride)
+    scene = read_views(footprints.used, coarse, settings.masks, progress=progress)
     names = [view.name for view in scene.views]
-    files = named_files(files, names)
-    samples = _samples(files, grid, settings, scene.thresholds, progress)
+    samples = _samples(footprints, settings, scene.thresholds, progress)
     priors = samples[0][1].priors
     initial = fill_holes(scene.heights)
     first = scene.views[0]
@@ -156,16 +154,17 @@ def named_files(files, names):
     return replace(files, images=tuple(files.images[k] for k in kept), cameras=cameras)
 
 
-def _samples(files, grid, settings, thresholds, progress):
+def _samples(footprints, settings, thresholds, progress):
     """Names and solution of each window at full resolution, the scene's middle first.
 
     Its priors hold for the next ones, as they will for the tiles; only an image that no window
     before has seen needs the estimate of its noise.
     """
-    windows = _sample_windows(grid.shape)
+    windows = _sample_windows(footprints.grid.shape)
     found, interpolated, noise = [], 0, {}
     for window in progress(windows, "windows"):
-        part = grid.cut(window)
+        part = footprints.grid.cut(window)
+        files = named_files(footprints.within(window), thresholds)
         try:
             scene = read_views(files, part, settings.masks, thresholds=thresholds)
         except UnreadableError:

@@ -11,30 +11,32 @@ import numpy as np
 from lommel.errors import GeometryError, InputError, LommelError
 from lommel.io.cameras import find_camera, read_camera
 from lommel.io.positions import find_position, read_positions
-from lommel.io.raster import raster_info, read_grid, read_pixels
+from lommel.io.raster import raster_info, read_pixels
 from lommel.progress import silent
+from lommel.run.footprints import (
+    camera_window,
+    find_footprints,
+    ground_sample_distance,
+    named_cameras,
+    not_seen,
+)
 from lommel.run.inputs import (
-    DEM_IS_FINE_ENOUGH,
-    GridSettings,
     Skipped,
-    choose_grid,
     left_out,
     listing,
-    place_images,
     read_heights,
     read_scene,
     refuse_duplicates,
-    refuse_unusable,
 )
 from lommel.scene.body import MOON, to_xyz
 from lommel.scene.camera import ReducedCamera
-from lommel.scene.grid import Grid, Window, bounds_in, grid_from_bounds, read_crs
+from lommel.scene.grid import Grid, Window
 from lommel.scene.masks import CLIPPED, MARGIN, MaskSettings, shadow_thresholds, widened
 from lommel.scene.ortho import needed_pixels
 from lommel.scene.view import CameraView, OrthoView
 
 LEAST_SHARED = 8  # rows and columns of posts; a thinner sliver of an image tells no slope apart
-SIGHTS = 65  # posts along each side that are tried to see whether a camera sees the DEM
+SIGHTS = 65  # posts along each side of where a camera may look: does it see the DEM, and how
 PIXELS_AT_ONCE = 2**23  # of an image read for their means: 32 MiB
 EDGE = 8  # pixels read around those that show the ground: slopes and relief move points
 LEAST_LIT = 0.01  # share of an image's pixels that must be lit and unclipped for it to be used
@@ -83,15 +85,21 @@ def read_views(files, grid_settings=None, masks=None, body=MOON, progress=silent
     -------
     terrain : ViewedTerrain
     """
+    if thresholds is not None and not files.images:
+        raise InputError("No image shows this part of the scene.")
     refuse_duplicates(files.images)
-    grid_settings = grid_settings or GridSettings()
+    grid, skipped = grid_settings, []
+    if not isinstance(grid, Grid):
+        found = find_footprints(files, grid_settings, body)
+        files, grid, skipped = found.files, found.grid, list(found.skipped)
     cameras, is_part = _camera_files(files), thresholds is not None
     flat = tuple(path for path in files.images if path not in cameras)
-    views, skipped = [], []
+    views = []
     if flat:
         only_flat = replace(files, images=flat)
-        scene = read_scene(only_flat, grid_settings, "dem", body, progress, is_part=is_part)
-        grid, heights, skipped = scene.grid, scene.heights, list(scene.skipped)
+        scene = read_scene(only_flat, grid, "dem", body, progress, is_part=is_part)
+        heights = scene.heights
+        skipped += scene.skipped
         views = [
             (OrthoView(observation), observation.saturation)
             for observation in scene.observations
@@ -99,9 +107,8 @@ def read_views(files, grid_settings=None, masks=None, body=MOON, progress=silent
         ]
         skipped += [_sliver(o) for o in scene.observations if min(o.window.shape) < LEAST_SHARED]
     else:
-        grid = _terrain_grid(files.dems, cameras, grid_settings, body)
         heights = read_heights(files.dems, grid, body)
-    suns = _sun_table(files, body) if cameras else None
+    suns = sun_table(files, body) if cameras else None
     for path in progress(list(cameras), "images") if cameras else ():
         try:
             views.append(
@@ -120,36 +127,6 @@ def read_views(files, grid_settings=None, masks=None, body=MOON, progress=silent
     if not usable:
         raise InputError("No image can be used.\n" + listing(skipped))
     return ViewedTerrain(grid, heights, usable, skipped, thresholds)
-
-
-def view_grid(files, grid_settings=None, body=MOON):
-    """The grid that `read_views` would choose, from the headers of the files alone.
-
-    Parameters
-    ----------
-    files : SceneFiles
-    grid_settings : GridSettings, optional
-    body : Body
-
-    Returns
-    -------
-    grid : Grid
-    """
-    refuse_duplicates(files.images)
-    settings = grid_settings or GridSettings()
-    cameras = _camera_files(files)
-    flat = [path for path in files.images if path not in cameras]
-    if not flat:
-        return _terrain_grid(files.dems, cameras, settings, body)
-    if not files.dems:
-        raise InputError("No DEM given. Name at least one with --dem.")
-    dem_grids = [read_grid(path, body) for path in files.dems]
-    image_grids, skipped = place_images(flat, dem_grids, body)
-    if not image_grids:
-        raise InputError("No image can be used.\n" + listing(skipped))
-    grid = choose_grid(list(image_grids.values()), dem_grids, settings, "dem", body)
-    refuse_unusable(grid)
-    return grid
 
 
 def _sliver(observation):
@@ -196,106 +173,64 @@ def mask_views(views, thresholds):
 
 def _camera_files(files):
     """Camera file of each image that has one."""
-    if files.cameras and len(files.cameras) != len(files.images):
-        raise InputError(
-            f"--cameras names {len(files.cameras)} files for {len(files.images)} images. "
-            "Name one per image, in the same order."
-        )
-    paths = files.cameras or [find_camera(path) for path in files.images]
+    paths = named_cameras(files) or [find_camera(path) for path in files.images]
     return {image: path for image, path in zip(files.images, paths, strict=True) if path}
-
-
-def _terrain_grid(dems, cameras, settings, body):
-    """The DEM's own posts, unless told otherwise or coarser than the images."""
-    if isinstance(settings, Grid):
-        return settings
-    if not dems:
-        raise InputError("No DEM given. Name at least one with --dem.")
-    grids = [read_grid(path, body) for path in dems]
-    gsd = _least_gsd(cameras, grids[0])
-    dem_spacing = max(grids[0].spacing)
-    is_fine_enough = gsd is None or dem_spacing < DEM_IS_FINE_ENOUGH * gsd
-    if settings.is_automatic and len(grids) == 1 and is_fine_enough:
-        return grids[0]
-    crs = read_crs(settings.crs, body, "--crs") if settings.crs else grids[0].crs
-    bounds = np.array([bounds_in(grid, crs) for grid in grids])
-    union = *bounds[:, :2].min(axis=0).tolist(), *bounds[:, 2:].max(axis=0).tolist()
-    spacing = settings.spacing
-    if spacing is None:
-        spacing = dem_spacing if is_fine_enough else gsd
-    grid = grid_from_bounds(settings.bounds or union, spacing, crs, body)
-    refuse_unusable(grid)
-    return grid
-
-
-def _least_gsd(cameras, grid):
-    """Median ground sample distance of the images at the DEM's centre; None when none sees it."""
-    found = []
-    for image, path in cameras.items():
-        try:
-            camera = read_camera(path, raster_info(image).shape)
-        except LommelError:
-            continue  # reported when the image is read
-        found.append(ground_sample_distance(camera, grid, 0.0))
-    found = [gsd for gsd in found if np.isfinite(gsd)]
-    return float(np.median(found)) if found else None
-
-
-def ground_sample_distance(camera, grid, height):
-    """Ground distance between pixels at the centre of a grid, m; NaN when out of view.
-
-    Parameters
-    ----------
-    camera : Camera
-    grid : Grid
-    height : float, m
-    """
-    middle = grid.cut(
-        replace(grid.window, row=grid.shape[0] // 2, col=grid.shape[1] // 2, rows=2, cols=2)
-    )
-    line, sample = camera.project(middle.xyz(height))
-    along_row = np.hypot(line[0, 1] - line[0, 0], sample[0, 1] - sample[0, 0])
-    along_col = np.hypot(line[1, 0] - line[0, 0], sample[1, 0] - sample[0, 0])
-    pixels = (along_row * along_col) ** 0.5
-    return (grid.spacing[0] * grid.spacing[1]) ** 0.5 / pixels if pixels > 0 else np.nan
 
 
 def _camera_view(path, camera_path, suns, files, grid, heights, body, is_part):
     info = raster_info(path, body)
     camera = read_camera(camera_path, info.shape)
     height = float(np.nanmean(heights, dtype=float))
+    ends = np.nanmin(heights), np.nanmax(heights)
+    shown = camera_window(camera, grid, *ends)
+    if shown.is_empty:
+        raise GeometryError(not_seen(path))
     posts = (
-        np.linspace(0, grid.shape[0] - 1, SIGHTS)[:, None],
-        np.linspace(0, grid.shape[1] - 1, SIGHTS),
+        shown.row + np.linspace(0, shown.rows - 1, SIGHTS)[:, None],
+        shown.col + np.linspace(0, shown.cols - 1, SIGHTS),
     )
     at_posts = grid.lonlat_at(*posts)
     line, sample = camera.project(to_xyz(body, *at_posts, height))
     if not camera.contains(line, sample).any():
-        raise GeometryError(
-            f"{path.name}: its camera does not see the DEM. Check that camera and DEM belong to "
-            "the same place, and the units of the camera file (metres)."
-        )
+        raise GeometryError(not_seen(path))
     gsd = ground_sample_distance(camera, grid, height)
     factor = int(min(grid.spacing) / gsd + 0.5) if np.isfinite(gsd) else 1
     window = Window(0, 0, *info.shape)
     if is_part:
-        ends = [
-            camera.project(to_xyz(body, *at_posts, end))
-            for end in (np.nanmin(heights), np.nanmax(heights))
-        ]
-        window = _shown_part(ends, info.shape)
+        window = _shown_part(
+            [camera.project(to_xyz(body, *at_posts, end)) for end in ends], info.shape
+        )
     image, first = _read_reduced(path, window, factor)
     if factor > 1:  # finer pixels than posts: their means are what the cells can explain
         camera = ReducedCamera(camera, factor)
-    sun = camera.sun_position
-    if sun is None and suns is None:
+    sun = sun_of(camera, path, suns, files)
+    return CameraView(path.name, image, camera, sun, first), info.saturation
+
+
+def sun_of(camera, path, suns, files):
+    """Where the Sun stood: as the camera tells, or a table.
+
+    Parameters
+    ----------
+    camera : Camera
+    path : Path
+        Of the image.
+    suns : dict or None
+        As `sun_table` reads it.
+    files : SceneFiles
+
+    Returns
+    -------
+    sun_position : array (3,), m, body-fixed
+    """
+    if camera.sun_position is not None:
+        return camera.sun_position
+    if suns is None:
         raise InputError(
             f"{path.name}: the camera file does not tell where the Sun stood. Name a table of "
             "lines KEY x y z with --sun-positions."
         )
-    if sun is None:
-        sun = find_position(suns, path.name, files.sun_positions)
-    return CameraView(path.name, image, camera, sun, first), info.saturation
+    return find_position(suns, path.name, files.sun_positions)
 
 
 def _shown_part(ends, shape):
@@ -334,7 +269,7 @@ def _reduce(image, factor):
     return squares.mean(axis=(1, 3), dtype=np.float32)
 
 
-def _sun_table(files, body):
+def sun_table(files, body):
     """The table of Sun positions for cameras that know none; None when there is no table."""
     if files.sun_positions is None:
         return None

@@ -175,6 +175,10 @@ class Grid:
         -------
         longitude, latitude : array (n,), rad; not finite where the projection does not reach
         """
+        return self._outline
+
+    @cached_property
+    def _outline(self):
         rows, cols = self.shape
         share = np.linspace(0.0, 1.0, LATTICE)
         lattice = np.stack(self.lonlat_at(share[:, None] * rows - 0.5, share * cols - 0.5))
