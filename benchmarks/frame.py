@@ -201,6 +201,13 @@ def ensure_frame(folder, posts):
     print(f"made in {time.perf_counter() - start:.0f} s, {most:.1f} GB", flush=True)
 
 
+def sfs_command(folder, output):
+    """The command that refines the frame of a folder."""
+    command = [str(Path(sys.executable).parent / "lommel"), "sfs", str(folder / "img1.tif")]
+    command += ["--dem", str(folder / "init_dem.tif"), "--output", str(output), "--overwrite"]
+    return [*command, "--sun-positions", str(folder / "sun_positions.txt")]
+
+
 def main():
     """Make, refine, compare; the folder stays for a look and is removed by hand."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -210,10 +217,7 @@ def main():
     given = parser.parse_args()
     folder, output = given.folder, given.folder / "refined"
     ensure_frame(folder, given.posts)
-    command = [str(Path(sys.executable).parent / "lommel"), "sfs", str(folder / "img1.tif")]
-    command += ["--dem", str(folder / "init_dem.tif"), "--output", str(output), "--overwrite"]
-    command += ["--sun-positions", str(folder / "sun_positions.txt"), *given.options]
-    seconds, peak = peak_of(command)
+    seconds, peak = peak_of([*sfs_command(folder, output), *given.options])
     per_post = 1e6 * seconds / given.posts**2
     print(f"refined in {seconds:.0f} s, {per_post:.2f} us per post; {peak / 1e9:.2f} GB at most")
     record = json.loads((output / "run.json").read_text(encoding="utf-8"))

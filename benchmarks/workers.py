@@ -10,22 +10,19 @@ import argparse
 import json
 import os
 import subprocess
-import sys
 import time
 from hashlib import sha256
 from pathlib import Path
 
 from distributed import LocalCluster
 
-from benchmarks.frame import ensure_frame
+from benchmarks.frame import ensure_frame, sfs_command
 
 
 def refine(folder, memory, workers):
     """Run ``lommel sfs`` on a cluster; seconds of the whole, record, digests of the products."""
     output = folder / f"workers-{workers}"
-    command = [str(Path(sys.executable).parent / "lommel"), "sfs", str(folder / "img1.tif")]
-    command += ["--dem", str(folder / "init_dem.tif"), "--output", str(output), "--overwrite"]
-    command += ["--sun-positions", str(folder / "sun_positions.txt"), "--memory", memory]
+    command = [*sfs_command(folder, output), "--memory", memory]
     with LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster:
         start = time.perf_counter()
         scheduler = ["--engine", "dask", "--dask-scheduler", cluster.scheduler_address]
