@@ -54,24 +54,20 @@ def run(folder, output, names, all_images):
     print(json.dumps(found))
 
 
+def make_many(kind, seed, folder):
+    """Write a scene of many images; its folder."""
+    place = folder / f"{kind}{seed}"
+    suns, cameras = lights(kind, seed)
+    light = {"suns_deg": suns, "cameras_deg": cameras}
+    make_scene(Scene(POSTS, IMAGES, seed, albedo_contrast=0.1, noise=0.0075, **light), place)
+    return place
+
+
 def main(folder):
     print("| scene | images | height, m | slope, deg | processor s | peak MB |")
     print("|---|---|---|---|---|---|")
     for kind, seed in SCENES:
-        place = folder / f"{kind}{seed}"
-        suns, cameras = lights(kind, seed)
-        make_scene(
-            Scene(
-                POSTS,
-                IMAGES,
-                seed,
-                albedo_contrast=0.1,
-                noise=0.0075,
-                suns_deg=suns,
-                cameras_deg=cameras,
-            ),
-            place,
-        )
+        place = make_many(kind, seed, folder)
         names = sorted(path.name for path in place.glob("img*.tif"))
         chosen = report(place, f"{kind} {seed}, chosen", names, False)
         report(place, f"{kind} {seed}, all", names, True)

@@ -24,9 +24,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from benchmarks.choice import lights
+from benchmarks.choice import SCENES, make_many
 from benchmarks.one import accuracy
-from benchmarks.scenes import Scene, make_scene
 
 from lommel.estimate import image_choice
 from lommel.run.footprints import find_footprints
@@ -36,26 +35,12 @@ from lommel.run.shape_from_shading import SfsSettings, run_shape_from_shading
 
 COUNTS = (3, 4, 6, 8, 12, 24)
 DRAWS = 3
-SCENES = (("passes", 1), ("passes", 2), ("spread", 1))
 
 
 def main(folder):
     """Print the table."""
     for kind, seed in SCENES:
-        place = folder / f"{kind}{seed}"
-        suns, cameras = lights(kind, seed)
-        make_scene(
-            Scene(
-                384,
-                24,
-                seed,
-                albedo_contrast=0.1,
-                noise=0.0075,
-                suns_deg=suns,
-                cameras_deg=cameras,
-            ),
-            place,
-        )
+        place = make_many(kind, seed, folder)
         files = SceneFiles(
             tuple(sorted(place.glob("img*.tif"))),
             (place / "init_dem.tif",),
