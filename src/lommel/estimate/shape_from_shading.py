@@ -247,10 +247,13 @@ def solve_surface(
             u, converged = solve_jointly(finest, u, priors.albedo_contrast, settings, history)
     else:
         u, converged = _coarse_to_fine(finest, settings, history, start)
-    here = replace(finest, pins=None, pinned=None).expand(u)
-    sums, left_over = here.sums, None
-    if start is not None:
+    left_over = None
+    if start is None:
+        sums = finest.assemble(u)[2]
+    else:
+        here = replace(finest, pins=None, pinned=None).expand(u)
         left_over = remainder(finest, here, u, start.own, start.stride.bit_length() - 1)
+        sums = here.sums
     misfits = np.sqrt(sums[:, SUM_RR] / np.maximum(sums[:, SUM_COUNT], 1))
     left = misfits if start is None else start.misfits
     if settings.estimate_albedo and not is_joint and left.max() > EXPLAINED:
