@@ -78,6 +78,19 @@ Reflectance = Annotated[
 Registers = Annotated[
     bool, typer.Option("--register", help="Register raw images to the DEM first.")
 ]
+Engine = Annotated[
+    str,
+    typer.Option(
+        help="Parts of a large run one after the other (serial), in processes, or by dask."
+    ),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        help="Address of a Dask cluster that runs, like tcp://10.0.0.1:8786; --memory is then "
+        "what one worker may take. Default: a cluster of this machine."
+    ),
+]
 BY_SOLVER = "Default: as published with --solver alternating, else "
 OwnReflectance = Annotated[
     str | None,
@@ -135,6 +148,15 @@ def albedo(
             "Default: 60 % of what is free."
         ),
     ] = None,
+    engine: Engine = "serial",
+    dask_scheduler: Scheduler = None,
+    tiles: Annotated[
+        str | None,
+        typer.Option(
+            help="A job of an array: 0/64 looks where images lie, then 1/64 to 64/64 share the "
+            "work, and `lommel merge` writes the products."
+        ),
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show passes, memory, disk and time; solve nothing.")
     ] = False,
@@ -144,7 +166,7 @@ def albedo(
     from lommel.run.albedo import albedo_settings, run_albedo
     from lommel.run.albedo_plan import plan_albedo
     from lommel.run.mixed_scene import place_scene
-    from lommel.run.tiles_plan import read_memory
+    from lommel.run.tiles_plan import Tiling, read_memory
 
     settings = albedo_settings(
         solver=solver,
@@ -158,13 +180,35 @@ def albedo(
     )
     files = _files(images, dem, sun_positions, spacecraft_positions, positions_unit, cameras)
     grid = _grid(spacing, crs, bounds)
-    size = None if memory is None else read_memory(memory)
+    tiling = Tiling(
+        None if memory is None else read_memory(memory), engine, scheduler=dask_scheduler
+    )
     if dry_run:
-        typer.echo(plan_albedo(place_scene(files, grid), settings, size))
+        is_shared = tiles is not None
+        typer.echo(plan_albedo(place_scene(files, grid), settings, tiling, is_shared))
+        return
+    if tiles is not None:
+        _share_albedo(tiles, registers, files, output, settings, grid, tiling)
         return
     with _progress() as progress:
-        run_albedo(files, output, settings, grid, overwrite, progress, registers, size)
+        run_albedo(files, output, settings, grid, overwrite, progress, registers, tiling)
     _finish(output)
+
+
+def _share_albedo(text, registers, *request):
+    from lommel.run.albedo_array import prepare_albedo, solve_albedo_share
+    from lommel.run.shares import read_share, refuse_registration
+
+    share = read_share(text)
+    refuse_registration(registers)
+    with _progress() as progress:
+        if share.number == 0:
+            count = prepare_albedo(*request, progress)
+            done = f"The run is prepared: {count} images for {share.count} jobs."
+        else:
+            solve_albedo_share(*request, share, progress)
+            done = f"Share {share} is done, and what others had left. `lommel merge` comes next."
+    log.print(done, soft_wrap=True)
 
 
 @app.command()
@@ -239,17 +283,8 @@ def sfs(
             "Default: 60 % of what is free."
         ),
     ] = None,
-    engine: Annotated[
-        str,
-        typer.Option(help="Tiles one after the other (serial), in processes, or by dask."),
-    ] = "serial",
-    dask_scheduler: Annotated[
-        str | None,
-        typer.Option(
-            help="Address of a Dask cluster that runs, like tcp://10.0.0.1:8786; --memory is then "
-            "what one worker may take. Default: a cluster of this machine."
-        ),
-    ] = None,
+    engine: Engine = "serial",
+    dask_scheduler: Scheduler = None,
     tiles: Annotated[
         str | None,
         typer.Option(
@@ -309,7 +344,8 @@ def sfs(
 
 
 def _solve_share(text, *request):
-    from lommel.run.tiles_array import prepare_array, read_share, solve_share
+    from lommel.run.shares import read_share
+    from lommel.run.tiles_array import prepare_array, solve_share
 
     share = read_share(text)
     with _progress() as progress:
@@ -324,14 +360,15 @@ def _solve_share(text, *request):
 
 @app.command()
 def merge(
-    output: Annotated[Path, typer.Argument(help="The --output of `lommel sfs --tiles`.")],
+    output: Annotated[Path, typer.Argument(help="The --output of the jobs with --tiles.")],
     overwrite: Overwrite = False,
 ):
     """Write the products of a job array when all of its shares are solved."""
+    from lommel.run.albedo_array import is_prepared, merge_albedo
     from lommel.run.tiles_array import merge_tiles
 
     with _progress() as progress:
-        merge_tiles(output, overwrite, progress)
+        (merge_albedo if is_prepared(output) else merge_tiles)(output, overwrite, progress)
     _finish(output, draws_report=False)
 
 

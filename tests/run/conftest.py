@@ -6,8 +6,9 @@ import pytest
 from benchmarks.scenes import Scene, make_scene
 
 from lommel.run.shape_from_shading import SfsSettings, run_shape_from_shading
+from lommel.run.shares import Share
 from lommel.run.simulate import run_simulate
-from lommel.run.tiles_array import Share, prepare_array, solve_share
+from lommel.run.tiles_array import prepare_array, solve_share
 from lommel.run.tiles_plan import Tiling, work_folder
 
 from .albedo_scene import SMALL

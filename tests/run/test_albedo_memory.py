@@ -17,6 +17,7 @@ from lommel.run.albedo import run_albedo
 from lommel.run.albedo_plan import plan_albedo
 from lommel.run.albedo_records import work_folder
 from lommel.run.mixed_scene import Place, PlacedScene, place_scene
+from lommel.run.tiles_plan import Tiling
 from lommel.scene.grid import Window, grid_from_bounds, read_crs
 
 from .albedo_scene import few_steps, files_of
@@ -60,7 +61,7 @@ def test_memory_does_not_change_the_products(ground, tmp_path, monkeypatch, unbr
     for name, size in (("little", 0.57e9), ("some", 1e9), ("all", 1e12)):
         if name == "all":
             monkeypatch.setattr(albedo_plan, "HELD_BYTES", 2**26)
-        run_albedo(files_of(ground), tmp_path / name, few_steps(), memory=size)
+        run_albedo(files_of(ground), tmp_path / name, few_steps(), tiling=Tiling(size))
         assert content(tmp_path / name) == unbroken
         assert not work_folder(tmp_path / name).exists()
     assert [plan.waits_on_disk for plan in plans] == [True, True, False]
@@ -102,7 +103,9 @@ def test_killed_run_goes_on_where_it_was(ground, tmp_path, unbroken):
     output = tmp_path / "out"
     kill_within(ground, output, "images")
     kept = {path.name for path in work_folder(output).glob("[!.]*")}
-    assert kept == {"heights", "image-00000", "image-00001", "image-00002"}
+    images = {name for name in kept if name.startswith("image")}
+    assert images == {f"image-{k:05d}" for k in range(4)}
+    assert kept - images == {f"heights-{k:05d}" for k in range(len(kept) - 4)}
     written = {name: (work_folder(output) / name / "rows").stat().st_mtime_ns for name in kept}
     kill_within(ground, output, "maps, block")
     assert {
@@ -111,7 +114,7 @@ def test_killed_run_goes_on_where_it_was(ground, tmp_path, unbroken):
     steps = Steps()
     run_albedo(files_of(ground), output, few_steps(), progress=steps)
     assert content(output) == unbroken
-    assert "terrain" not in steps and "pass 1, block" not in steps and "maps, block" in steps
+    assert "pass 1, block" not in steps and "maps, block" in steps
     assert not work_folder(output).exists()
 
 
@@ -147,8 +150,8 @@ def test_photometry_comes_back_to_the_last_bit(ground, tmp_path, monkeypatch):
     found = []
     original = albedo_records.Kept.photometry
 
-    def twice(kept, compute):
-        found.extend([original(kept, compute), original(kept, None)])
+    def twice(kept, compute, names):
+        found.extend([original(kept, compute, names), original(kept, None, names)])
         return found[1]
 
     monkeypatch.setattr(albedo_records.Kept, "photometry", twice)
@@ -172,9 +175,9 @@ def test_disk_without_room_is_told_before_images_are_read(ground, tmp_path, monk
 def test_least_memory_is_named_and_is_enough(ground):
     placed = place_scene(files_of(ground))
     with pytest.raises(InputError, match=r"--memory 0\.00 GB is too little.* need ") as error:
-        plan_albedo(placed, few_steps(), 1e6)
+        plan_albedo(placed, few_steps(), Tiling(1e6))
     least = 1e9 * float(re.search(r"need ([0-9.]+) GB", str(error.value))[1])
-    assert plan_albedo(placed, few_steps(), least).memory <= least
+    assert plan_albedo(placed, few_steps(), Tiling(least)).memory <= least
 
 
 @pytest.mark.parametrize("side", [10_000, 30_000])
@@ -190,7 +193,7 @@ def test_least_memory_does_not_grow_with_the_scene(side, monkeypatch):
     windows = [Window(row, col, 10_000, 10_000) for row in starts for col in starts]
     places = [Place("image", window) for window in windows for _ in range(4)]
     placed = PlacedScene(grid, None, places, [], [])
-    plan = plan_albedo(placed, few_steps(), 1e9)
+    plan = plan_albedo(placed, few_steps(), Tiling(1e9))
     assert plan.memory <= 1e9 and plan.waits_on_disk and plan.passes == 4
     assert plan.pixels == 4 * side**2 and plan.kept_pixels < 1e8
     assert "memory   1.00 GB" in str(plan) and "images   " in str(plan)

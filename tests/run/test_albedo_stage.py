@@ -70,7 +70,12 @@ def test_record_tells_settings_stages_and_outcome(product):
     record = json.loads((product[0] / "run.json").read_text(encoding="utf-8"))
     assert record["command"] == "albedo"
     assert record["settings"]["solver"] == "projection"
-    assert [stage["name"] for stage in record["stages"]] == ["read", "solve", "write"]
+    assert [stage["name"] for stage in record["stages"]] == [
+        "place",
+        "read",
+        "solve",
+        "write",
+    ]
     assert record["outcome"]["name"] == "converged"
     assert record["history"][-1]["cost"] <= record["history"][0]["cost"]
     assert "phase_c1_per_rad" not in record["results"]

@@ -9,7 +9,7 @@ import pytest
 from typer.main import get_command
 
 from lommel.cli import app
-from lommel.run.tiles_array import read_share
+from lommel.run.shares import read_share
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "scaling.md").read_text(encoding="utf-8")
 COMMANDS = sorted(set(re.findall(r"\blommel (?:albedo|sfs|merge) [^`|#\n]*", PAGE)))

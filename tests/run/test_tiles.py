@@ -13,6 +13,7 @@ from lommel.errors import InputError, LommelError
 from lommel.io import raster
 from lommel.io.raster import read_grid, read_on_grid, read_pixels
 from lommel.run import tiles
+from lommel.run.records import digest_of, is_done, read_record, save_part
 from lommel.run.shape_from_shading import run_shape_from_shading
 from lommel.run.tiles_plan import (
     HALO,
@@ -24,7 +25,7 @@ from lommel.run.tiles_plan import (
     read_memory,
     work_folder,
 )
-from lommel.run.tiles_records import digest_of, is_done, part_folder, read_record, save_part
+from lommel.run.tiles_records import part_folder
 from lommel.scene.grid import Window
 
 from .tiled_scene import SIDE, files_of, fingerprints

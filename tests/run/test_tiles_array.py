@@ -11,7 +11,8 @@ from lommel.cli import app
 from lommel.errors import InputError, LommelError
 from lommel.run import tiles
 from lommel.run.shape_from_shading import SfsSettings
-from lommel.run.tiles_array import Share, merge_tiles, prepare_array, read_share, solve_share
+from lommel.run.shares import Share, read_share
+from lommel.run.tiles_array import merge_tiles, prepare_array, solve_share
 from lommel.run.tiles_plan import Tiling, work_folder
 
 from .tiled_scene import SIDE, files_of, fingerprints
@@ -86,7 +87,7 @@ def test_what_cannot_be_shared_is_refused(tile_scene, tmp_path):
 
 
 def test_work_of_another_version_is_refused(half_done, monkeypatch):
-    monkeypatch.setattr("lommel.run.tiles_records.__version__", "0.0.0")
+    monkeypatch.setattr("lommel.run.records.__version__", "0.0.0")
     assert "0.0.0" in tiles.solve_part(work_folder(half_done), 1)
 
 

@@ -7,10 +7,11 @@ import subprocess
 import pytest
 
 from lommel.errors import LommelError
+from lommel.run.records import disk_errors, is_done, read_record
 from lommel.run.shape_from_shading import run_shape_from_shading
 from lommel.run.tiles import solve_part
 from lommel.run.tiles_plan import Tiling, work_folder
-from lommel.run.tiles_records import disk_errors, is_done, load_run, part_folder, read_record
+from lommel.run.tiles_records import load_run, part_folder
 
 from .tiled_scene import SIDE, files_of, fingerprints
 

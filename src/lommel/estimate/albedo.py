@@ -36,12 +36,12 @@ from lommel.estimate.albedo_equations import (
     noise_scale,
     standard_errors,
     visit,
+    visitor_of,
 )
-from lommel.estimate.albedo_maps import LastPass, MapRows, WholeMaps
+from lommel.estimate.albedo_maps import MapMaker, MapRows, WholeMaps, disagreement_of
 from lommel.estimate.albedo_samples import SampleBlocks, overlapping_pairs
 from lommel.estimate.albedo_settings import AlbedoSettings, check_settings
 from lommel.estimate.albedo_solver import solve, weighting
-from lommel.progress import silent
 
 WEIGHINGS = 2  # passes over all posts that tell the noise scale, once exposures come from cells
 
@@ -144,7 +144,7 @@ def estimate_albedo(
     grid,
     heights,
     settings=None,
-    progress=silent,
+    jobs=None,
     take=None,
     kept_pixels=None,
     remember=None,
@@ -157,11 +157,10 @@ def estimate_albedo(
     grid : Grid
     heights : array (rows, cols), m
     settings : AlbedoSettings, optional
-    progress : callable
-        Shows how far each pass over the images is.
+    jobs : InThreads, optional
+        Works on the images and on blocks of rows.
     take : function (first row, MapRows), optional
-        Takes the maps some rows at a time, from several threads in any order; else the result
-        holds them whole.
+        Takes the maps some rows at a time, from north to south; else the result holds them whole.
     kept_pixels : int, optional
         As `SampleBlocks` takes it.
     remember : function (compute), optional
@@ -171,10 +170,30 @@ def estimate_albedo(
     -------
     result : AlbedoResult
     """
-    settings = settings or AlbedoSettings()
+    given = observations, grid, heights, settings or AlbedoSettings()
+    problem, found = find_photometry(*given, jobs, kept_pixels, remember)
+    whole = WholeMaps(grid.shape) if take is None else None
+    return collect(problem, found, make_maps(problem, found), take or whole, whole)
+
+
+def find_photometry(
+    observations, grid, heights, settings, jobs=None, kept_pixels=None, remember=None
+):
+    """All but the maps.
+
+    Parameters
+    ----------
+    observations, grid, heights, settings, jobs, kept_pixels, remember
+        As of `estimate_albedo`.
+
+    Returns
+    -------
+    problem : Problem
+    found : Photometry
+    """
     check_settings(settings)
     model = reflectance_model(settings.reflectance)
-    terms = model, settings.masks, settings.slope_noise, kept_pixels, progress
+    terms = model, settings.masks, settings.slope_noise, kept_pixels, jobs
     blocks = SampleBlocks(observations, grid, heights, *terms)
     if not len(blocks.levels):
         listing = [f"  {o.name}: {r}" for o, r in zip(observations, blocks.reasons, strict=True)]
@@ -186,7 +205,7 @@ def estimate_albedo(
             reason for reason, own in zip(found.reasons, blocks.reasons, strict=True) if not own
         ]
         blocks.keep(np.array([not reason for reason in used]), used)
-    return _map(_pose(blocks, settings), found, take)
+    return _pose(blocks, settings), found
 
 
 def _pose(blocks, settings):
@@ -235,9 +254,41 @@ def _fit(blocks, settings):
     )
 
 
-def _map(problem, found, take):
-    """Bring the gauge to mean exposure 1, and collect; the last pass leaves the maps."""
-    blocks, state, reasons = problem.blocks, found.state, problem.blocks.reasons
+def make_maps(problem, found):
+    """The last pass over the images.
+
+    Parameters
+    ----------
+    problem : Problem
+    found : Photometry
+
+    Returns
+    -------
+    maps : iterator
+        What `MapMaker` gives of each block, from north to south.
+    """
+    visitor = visitor_of(problem, found.state, found.weighted_with)
+    return problem.blocks.each(MapMaker(visitor, found.noise), "maps")
+
+
+def collect(problem, found, maps, take, whole=None):
+    """Hand on the maps, bring the gauge to mean exposure 1, and collect.
+
+    Parameters
+    ----------
+    problem : Problem
+    found : Photometry
+    maps : iterator
+        From `make_maps`.
+    take : function (first row, MapRows)
+    whole : WholeMaps, optional
+        That ``take`` fills.
+
+    Returns
+    -------
+    result : AlbedoResult
+    """
+    state, reasons = found.state, problem.blocks.reasons
     used = np.array([not reason for reason in reasons])
     gauge = state.exposure.mean()
 
@@ -246,10 +297,11 @@ def _map(problem, found, take):
         everyone[used] = values
         return everyone
 
-    whole = WholeMaps(blocks.shape) if take is None else None
-    last_pass = LastPass(state, found.noise, blocks.pixels, take or whole)
-    visit(problem, state, found.mean_log_albedo, found.weighted_with, 1.0, last_pass)
-    before, after = last_pass.disagreements()
+    before, after = [], []
+    for first, rows, *deviations in maps:
+        take(first, rows)
+        before.append(deviations[0])
+        after.append(deviations[1])
     indices = np.flatnonzero(used)
     return AlbedoResult(
         **(dict.fromkeys(MapRows.__annotations__) if whole is None else vars(whole.rows)),
@@ -261,8 +313,8 @@ def _map(problem, found, take):
         shared=state.shared,
         shared_errors=found.shared_errors,
         groups=tuple(tuple(indices[group].tolist()) for group in found.groups),
-        disagreement_before=before,
-        disagreement=after,
+        disagreement_before=disagreement_of(before),
+        disagreement=disagreement_of(after),
         noise=found.noise,
         repetition=found.repetition,
         passes=found.passes + 1,

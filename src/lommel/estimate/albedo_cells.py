@@ -14,12 +14,12 @@ ground it replaces, and the steps of the solver cost nothing beside the one pass
 cells. Most callers want `cells_of`.
 """
 
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
-from numba import get_num_threads
 
 from lommel.estimate.albedo_arrays import BLOCKS, Samples
+from lommel.jobs import InThreads
 
 ACROSS = 32  # cells along an image: enough to see a lens, few enough to leave relief behind
 FULLNESS = 8  # power of the used share of a cell in its weight: parts of it are other ground
@@ -92,7 +92,7 @@ class Cells:
         self.windows = np.concatenate([first, last - first], axis=1)
         self.count = min(BLOCKS, self.shape[0])
         sums = [np.zeros((7, *window[2:])) for window in self.windows]
-        for part in blocks.each(lambda block: _sums(blocks, block, size)):
+        for part in blocks.each(partial(_sums, blocks, size)):
             for k, row, values in part:
                 top = row - self.windows[k, 0]
                 sums[k][:, top : top + values.shape[1]] += values
@@ -108,8 +108,7 @@ class Cells:
 
     def each(self, visit, name=None):
         """As `SampleBlocks.each`, of which it is too quick to be told."""
-        with ThreadPoolExecutor(get_num_threads()) as threads:
-            yield from threads.map(visit, range(self.count))
+        return InThreads().each(visit, range(self.count), name)
 
     def span(self, block):
         """First row of a block, and the row behind its last one."""
@@ -130,7 +129,7 @@ class Cells:
         return Samples(self.windows, starts, *np.concatenate(parts, axis=1))
 
 
-def _sums(blocks, block, size):
+def _sums(blocks, size, block):
     """For each image in a block of rows: its number, first row of cells, sums over used posts."""
     first, last = blocks.span(block)
     if first == last:

@@ -22,7 +22,7 @@ from lommel.estimate.albedo_arrays import (
     State,
     Sums,
 )
-from lommel.estimate.albedo_kernels import accumulate
+from lommel.estimate.albedo_kernels import Visitor, accumulate
 from lommel.estimate.albedo_rows import LOSSES
 from lommel.estimate.albedo_samples import SampleBlocks
 from lommel.estimate.albedo_settings import AlbedoSettings
@@ -91,10 +91,14 @@ class Point:
     objective: float
 
 
-def visit(problem, state, mean_log_albedo, scale, repetition, keep=None):
+def visitor_of(problem, state, scale):
+    """What a pass over the images does at these parameters."""
+    return Visitor(problem.blocks, problem.pairs, state, scale, LOSSES[problem.settings.loss])
+
+
+def visit(problem, state, mean_log_albedo, scale, repetition):
     """One pass over the images: the sums and objective at these parameters; see `accumulate`."""
-    loss = LOSSES[problem.settings.loss]
-    sums = accumulate(problem.blocks, problem.pairs, state, scale, loss, keep)
+    sums = accumulate(visitor_of(problem, state, scale))
     point = Point(state, mean_log_albedo, scale, repetition, sums, 0.0)
     point.objective = float(sums.cost[0]) / repetition
     if problem.settings.solver == "projection":

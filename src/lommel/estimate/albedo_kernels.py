@@ -14,10 +14,21 @@ of the image's level) and by the shared ones (c1, c2, v2, v4). Loops run along r
 sums are kept per block of rows, so that results do not depend on the number of threads.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numba import njit
 
-from lommel.estimate.albedo_arrays import OWN, PATCHES, SHARED, Work, empty_maps, empty_sums
+from lommel.estimate.albedo_arrays import (
+    OWN,
+    PATCHES,
+    SHARED,
+    Pairs,
+    State,
+    Work,
+    empty_maps,
+    empty_sums,
+)
 from lommel.estimate.albedo_rows import (
     LEAST_SQUARES,
     brightness_row,
@@ -250,10 +261,11 @@ def _visit_rows(first_row, last_row, samples, pairs, state, scale, loss, maps, s
         _eliminate(samples, images, pairs, place_of, work, sums)
 
 
-def accumulate(blocks, pairs, state, scale, loss, keep=None):
-    """Visit every pixel once: best albedo, then the sums of a Gauss-Newton step.
+@dataclass(frozen=True, eq=False)
+class Visitor:
+    """Visits every pixel of a block of rows once, with the image parameters as they are.
 
-    Parameters
+    Attributes
     ----------
     blocks : SampleBlocks or Cells
     pairs : Pairs
@@ -263,30 +275,42 @@ def accumulate(blocks, pairs, state, scale, loss, keep=None):
         Standard error of a residual times the root of its precision.
     loss : int
         LEAST_SQUARES, HUBER or CAUCHY.
-    keep : function (first, last, samples, maps), optional
-        Called for each block of rows from first to before last with its samples and `Maps`, from
-        several threads in any order.
+    """
+
+    blocks: object
+    pairs: Pairs
+    state: State
+    scale: float
+    loss: int
+
+    def visit(self, block):
+        """Samples of a block, its `Maps` with the best albedo, and its `Sums`."""
+        first, last = self.blocks.span(block)
+        samples = self.blocks.block(block)
+        maps = empty_maps((last - first, self.blocks.shape[1]))
+        sums = empty_sums(len(self.blocks.windows), len(self.pairs.second))
+        _visit_rows(first, last, samples, self.pairs, self.state, self.scale, self.loss, maps, sums)
+        return samples, maps, sums
+
+    def __call__(self, block):
+        """Sums of a block."""
+        return self.visit(block)[2]
+
+
+def accumulate(visitor):
+    """Visit every pixel once: best albedo, then the sums of a Gauss-Newton step.
+
+    Parameters
+    ----------
+    visitor : Visitor
 
     Returns
     -------
     sums : Sums
         Of the blocks in their order, so that they do not depend on the threads.
     """
-    images = len(blocks.windows)
-
-    def visit_block(block):
-        first, last = blocks.span(block)
-        sums = empty_sums(images, len(pairs.second))
-        if first < last:
-            samples = blocks.block(block)
-            maps = empty_maps((last - first, blocks.shape[1]))
-            _visit_rows(first, last, samples, pairs, state, scale, loss, maps, sums)
-            if keep is not None:
-                keep(first, last, samples, maps)
-        return sums
-
-    total = empty_sums(images, len(pairs.second))
-    for sums in blocks.each(visit_block, "maps" if keep is not None else None):
+    total = empty_sums(len(visitor.blocks.windows), len(visitor.pairs.second))
+    for sums in visitor.blocks.each(visitor):
         for whole, part in zip(total, sums, strict=True):
             whole += part
     return total

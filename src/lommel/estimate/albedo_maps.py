@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lommel.estimate.albedo_kernels import Visitor
 from lommel.estimate.albedo_quality import deviations_from_mean, nmad
 from lommel.estimate.albedo_samples import clipped, orthomosaic
 
@@ -53,59 +54,47 @@ class WholeMaps:
             getattr(self.rows, name)[first : first + len(part)] = part
 
 
-class LastPass:
-    """What the last pass does with each block of rows; `accumulate` calls it.
-
-    Parameters
-    ----------
-    state : State
-    noise : float
-        Standard error of a residual, as a share of the image's level.
-    pixels : int
-        Of all images.
-    take : function (first row, MapRows)
+@dataclass(frozen=True, eq=False)
+class MapMaker:
+    """What the last pass does with each block of rows.
 
     Attributes
     ----------
-    before, after : dict of int to array
-        Deviations of the images as they are, and by the result, for each block by its first row;
-        of the block's upper rows where there are more than `COMPARED` pixels.
+    visitor : Visitor
+    noise : float
+        Standard error of a residual, as a share of the image's level.
     """
 
-    def __init__(self, state, noise, pixels, take):
-        self.state, self.noise, self.take = state, noise, take
-        self.share = min(1.0, COMPARED / pixels)
-        self.before, self.after = {}, {}
+    visitor: Visitor
+    noise: float
 
-    def __call__(self, first, last, samples, maps):
-        """Hand on the products of these rows and compare the images there."""
-        state, gauge = self.state, self.state.exposure.mean()
-        seen = maps.image_count > 0
-        error = _albedo_error(maps, self.noise)
-        here = clipped(samples, first, last)
-        self.take(
-            first,
-            MapRows(
-                np.where(seen, gauge * maps.albedo, np.nan).astype(np.float32),
-                np.where(seen, gauge * error, np.nan).astype(np.float32),
-                orthomosaic(here, seen.shape),
-                maps.image_count,
-            ),
+    def __call__(self, block):
+        """First row and `MapRows` of a block, and how the images deviate from each other there.
+
+        Deviations are of the images as they are, and by the result; of the block's upper rows where
+        all images together have more than `COMPARED` pixels.
+        """
+        blocks, state = self.visitor.blocks, self.visitor.state
+        first, last = blocks.span(block)
+        samples, maps, _ = self.visitor.visit(block)
+        seen, gauge = maps.image_count > 0, state.exposure.mean()
+        rows = MapRows(
+            np.where(seen, gauge * maps.albedo, np.nan).astype(np.float32),
+            np.where(seen, gauge * _albedo_error(maps, self.noise), np.nan).astype(np.float32),
+            orthomosaic(clipped(samples, first, last), seen.shape),
+            maps.image_count,
         )
-        part = first + int(self.share * last) - int(self.share * first)
+        share = min(1.0, COMPARED / blocks.pixels)
+        part = first + int(share * last) - int(share * first)
         here, shape = clipped(samples, first, part), (part - first, seen.shape[1])
-        self.before[first] = deviations_from_mean(here, shape)
-        self.after[first] = deviations_from_mean(
-            here, shape, state.exposure, state.haze, state.shared
-        )
-
-    def disagreements(self):
-        """Disagreement of the images as they are, and by the result; NaN without overlap."""
-        return tuple(_nmad_of(found) for found in (self.before, self.after))
+        before = deviations_from_mean(here, shape)
+        after = deviations_from_mean(here, shape, state.exposure, state.haze, state.shared)
+        return first, rows, before, after
 
 
-def _nmad_of(blocks):
-    values = np.concatenate([blocks[first] for first in sorted(blocks)])
+def disagreement_of(deviations):
+    """Disagreement of images, from their deviations in each block; NaN without overlap."""
+    values = np.concatenate(deviations)
     return nmad(values) if values.size else float("nan")
 
 

@@ -4,17 +4,25 @@ For each image: reflectance, phase and the angle off nadir at every post of its 
 feathering, and the expected variance of its pixels. Most callers want `SampleBlocks`.
 """
 
-from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import get_num_threads
 
+from lommel.core.reflectance import ReflectanceModel
 from lommel.estimate.albedo_arrays import BLOCKS, Pairs, Samples
 from lommel.estimate.albedo_light import ImageGeometry, TerrainPart
-from lommel.progress import silent
-from lommel.scene.geometry import surface_normals, unit, viewing_geometry
-from lommel.scene.grid import Window
-from lommel.scene.masks import feathering, pixel_weights, shadow_thresholds
+from lommel.jobs import InThreads
+from lommel.scene.geometry import Observation, surface_normals, unit, viewing_geometry
+from lommel.scene.grid import Grid, Window
+from lommel.scene.masks import (
+    MaskSettings,
+    falling,
+    known_span,
+    least_lit,
+    lit_brightness,
+    pixel_weights,
+    shadow_threshold,
+)
 
 ROWS_AT_ONCE = 256  # rows of geometry in memory, 200 bytes per post
 PIXELS_AT_ONCE = 2**21  # of all images in one block of rows, 24 bytes each
@@ -22,6 +30,7 @@ POSTS_AT_ONCE = 2**20  # of the grid in one block of rows, 100 bytes each
 KEPT_PIXELS = 2**26  # of all images whose samples are kept, 1.6 GB
 THIN = 2**22  # pixels that tell the level and the shadow threshold of an image
 STRIP = 32  # rows read together where not all are
+TOGETHER = 4  # blocks that another process does at a time
 PLANES = Samples._fields[2:]
 
 
@@ -154,30 +163,34 @@ class SampleBlocks:
         masks,
         slope_noise,
         kept_pixels=None,
-        progress=silent,
+        jobs=None,
     ):
-        self.grid, self.heights, self.model = grid, heights, model
+        self.grid, self.heights = grid, heights
         self.shape = grid.shape
-        self.masks, self.slope_noise = masks, slope_noise
-        self.progress, self.passes = progress, 0
-        thresholds = shadow_thresholds(ThinImages(observations, progress), masks)
-        with ThreadPoolExecutor(get_num_threads()) as threads:
-            seen = threads.map(self._look, observations, thresholds)
-            looks = list(progress(seen, "levels", len(observations), get_num_threads()))
-        frames, found = [frame for frame, _ in looks], [level for _, level in looks]
-        self.reasons = [reason for _, _, reason in found]
-        used = [k for k, reason in enumerate(self.reasons) if not reason]
-        self.levels, self.brightness = np.array([found[k][:2] for k in used]).reshape(-1, 2).T
-        self.frames = [frames[k] for k in used]
+        self.slope_noise, self.passes = slope_noise, 0
+        self.jobs = jobs or InThreads()
+        self.viewing = Viewing(grid, heights, model, masks)
+        lit = []
+        if masks.shadow_threshold is None:
+            lit = list(self.jobs.each(_thin_brightness, observations, "brightness"))
+        frames = list(self.jobs.each(Look(self.viewing, least_lit(lit)), observations, "levels"))
+        self.reasons = [frame.reason for frame in frames]
+        self.frames = [frame for frame in frames if not frame.reason]
+        self.levels = np.array([frame.level for frame in self.frames])
+        self.brightness = np.array([frame.brightness for frame in self.frames])
         windows = [(w.row, w.col, w.rows, w.cols) for w in (f.window for f in self.frames)]
         self.windows = np.array(windows, np.int64).reshape(-1, 4)
-        self.completeness = np.ones(len(used))
+        self.completeness = np.ones(len(self.frames))
         self.pixels = int(np.sum(self.windows[:, 2] * self.windows[:, 3]))
         self.edges, above = block_edges(self.windows, self.shape)
         self.count = len(self.edges) - 1
         self._kept: dict[int, Samples] = {}
         kept_pixels = KEPT_PIXELS if kept_pixels is None else kept_pixels
         self._keeps = int(np.searchsorted(above[self.edges[1:]], kept_pixels, side="right"))
+
+    def __getstate__(self):
+        """What another process has to know: neither who runs the jobs nor what is kept here."""
+        return vars(self) | {"jobs": None, "_kept": {}, "_keeps": 0}
 
     def keep(self, is_kept, reasons):
         """Leave out the used images of which ``is_kept`` is False, each for its reason."""
@@ -207,20 +220,18 @@ class SampleBlocks:
 
         Parameters
         ----------
-        visit : function (block)
-            Called from several threads.
+        visit : callable (block)
+            As `lommel.jobs.InThreads.each` takes it.
         name : str, optional
             Of the pass; by default its number.
 
-        Yields
-        ------
-        result : object
+        Returns
+        -------
+        results : iterator
         """
         self.passes += 1
         name = f"{name or f'pass {self.passes}'}, block"
-        with ThreadPoolExecutor(get_num_threads()) as threads:
-            results = threads.map(visit, range(self.count))
-            yield from self.progress(results, name, self.count, get_num_threads())
+        return self.jobs.each(visit, range(self.count), name, TOGETHER)
 
     def rows(self, first, last):
         """Samples of the rows from first to before last; only these rows may be asked for.
@@ -250,7 +261,7 @@ class SampleBlocks:
         return Samples(self.windows, starts, *planes)
 
     def _fill(self, planes, frame, part, terrain, level):
-        measured, geometry, weight, reflectance, gradient = self._see(frame, part, terrain)
+        measured, geometry, weight, reflectance, gradient = self.viewing.see(frame, part, terrain)
         precision = _precision(level, reflectance, gradient, self.slope_noise)
         if self.slope_noise is None:
             precision[:] = np.float32(1.0 / np.median(self.levels) ** 2)
@@ -258,38 +269,6 @@ class SampleBlocks:
         for plane, values in zip(planes, given, strict=True):
             plane[:] = values
             plane[np.isnan(plane)] = 0.0
-
-    def _see(self, frame, part, terrain):
-        image = frame.image
-        geometry = terrain.geometry(part, image.sun_position, image.spacecraft_position)
-        measured, weight = frame.weigh(part, geometry, self.masks)
-        reflectance, gradient = slope_sensitivity(self.model, geometry)
-        weight[~(reflectance > 0)] = 0.0
-        return measured, geometry, weight, reflectance, gradient
-
-    def _look(self, image, threshold):
-        """An image as a `Frame`; its level, mean brightness, and why it cannot be used, if so."""
-        frame = Frame(image, threshold)
-        return frame, self._level(frame)
-
-    def _level(self, frame):
-        step = max(1, -(-frame.window.rows * frame.window.cols // THIN))
-        total, value, answer = 0.0, 0.0, 0.0
-        has_ground = has_light = has_value = False
-        for every in {step: None, 1: None}:  # all rows before an image is given up
-            for part in _strips(frame.window, every):
-                terrain = TerrainPart(self.grid, self.heights, part)
-                measured, geometry, weight, reflectance, _ = self._see(frame, part, terrain)
-                total += float(np.sum(weight, dtype=float))
-                value += float(np.sum(weight * np.nan_to_num(measured), dtype=float))
-                answer += float(np.sum(weight * np.nan_to_num(reflectance), dtype=float))
-                known = np.isfinite(measured) & np.isfinite(geometry.cos_incidence)
-                has_ground |= bool(known.any())
-                has_light |= bool((known & (geometry.cos_incidence > 0)).any())
-                has_value |= bool((known & (measured > frame.threshold)).any())
-            if answer > 0:
-                return value / answer, value / total, ""
-        return np.nan, np.nan, _reason(has_ground, has_light, has_value, frame.threshold)
 
 
 def block_edges(windows, shape):
@@ -321,25 +300,113 @@ def block_edges(windows, shape):
     return edges, above
 
 
-class Frame:
-    """An image with what its whole decides about each part: shadow threshold and feathering.
+@dataclass(frozen=True)
+class Viewing:
+    """How an image shows the terrain.
 
-    Parameters
+    Attributes
+    ----------
+    grid : Grid
+    heights : array (rows, cols), m
+    model : ReflectanceModel
+    masks : MaskSettings
+    """
+
+    grid: Grid
+    heights: np.ndarray
+    model: ReflectanceModel
+    masks: MaskSettings
+
+    def see(self, frame, part, terrain):
+        """Some rows of an image: values, light and view, weight, reflectance and its gradient.
+
+        Parameters
+        ----------
+        frame : Frame
+        part : Window
+        terrain : TerrainPart
+            Holding at least these rows.
+        """
+        image = frame.image
+        geometry = terrain.geometry(part, image.sun_position, image.spacecraft_position)
+        measured, weight = frame.weigh(part, geometry, self.masks)
+        reflectance, gradient = slope_sensitivity(self.model, geometry)
+        weight[~(reflectance > 0)] = 0.0
+        return measured, geometry, weight, reflectance, gradient
+
+
+@dataclass(frozen=True)
+class Look:
+    """Looks at the whole of an image, an Observation, and makes a `Frame` of it.
+
+    Attributes
+    ----------
+    viewing : Viewing
+    least_lit : float, image units
+        Least brightness of lit ground.
+    """
+
+    viewing: Viewing
+    least_lit: float
+
+    def __call__(self, image):
+        """The image, its level and mean brightness, and why it cannot be used, if so."""
+        threshold = self.viewing.masks.shadow_threshold
+        if threshold is None:
+            thin = thinned(image.measured)
+            threshold = shadow_threshold(thin, max(lit_brightness(thin), self.least_lit))
+        frame = Frame(image, float(threshold), *_known_extent(image))
+        return replace(frame, **self._level(frame))
+
+    def _level(self, frame):
+        step = max(1, -(-frame.window.rows * frame.window.cols // THIN))
+        total, value, answer = 0.0, 0.0, 0.0
+        has_ground = has_light = has_value = False
+        for every in {step: None, 1: None}:  # all rows before an image is given up
+            for part in _strips(frame.window, every):
+                terrain = TerrainPart(self.viewing.grid, self.viewing.heights, part)
+                measured, geometry, weight, reflectance, _ = self.viewing.see(frame, part, terrain)
+                total += float(np.sum(weight, dtype=float))
+                value += float(np.sum(weight * np.nan_to_num(measured), dtype=float))
+                answer += float(np.sum(weight * np.nan_to_num(reflectance), dtype=float))
+                known = np.isfinite(measured) & np.isfinite(geometry.cos_incidence)
+                has_ground |= bool(known.any())
+                has_light |= bool((known & (geometry.cos_incidence > 0)).any())
+                has_value |= bool((known & (measured > frame.threshold)).any())
+            if answer > 0:
+                return {"level": value / answer, "brightness": value / total}
+        return {"reason": _reason(has_ground, has_light, has_value, frame.threshold)}
+
+
+@dataclass(frozen=True)
+class Frame:
+    """An image with what its whole decides about each part.
+
+    Attributes
     ----------
     image : Observation
     threshold : float, image units
+        Shadow up to here.
+    known_rows, known_cols : (first, number) of int
+        Rows and columns of its window that hold values: feathering ends with them.
+    level, brightness : float, image units
+        As of `SampleBlocks`.
+    reason : str
+        Why it cannot be used; empty where it can.
     """
 
-    def __init__(self, image, threshold):
-        self.image, self.threshold, self.window = image, float(threshold), image.window
-        rows, cols = image.window.shape
-        in_row, in_col = np.zeros(rows, bool), np.zeros(cols, bool)
-        for first in range(0, rows, ROWS_AT_ONCE):
-            known = np.isfinite(image.measured[first : first + ROWS_AT_ONCE])
-            in_row[first : first + ROWS_AT_ONCE] = known.any(axis=1)
-            in_col |= known.any(axis=0)
-        self.along_rows = feathering((rows, 1), in_row[:, None])
-        self.along_cols = feathering((1, cols), in_col[None, :])
+    image: Observation
+    threshold: float
+    known_rows: tuple[int, int]
+    known_cols: tuple[int, int]
+    level: float = np.nan
+    brightness: float = np.nan
+    reason: str = ""
+
+    @property
+    def window(self):
+        """Of the image on the grid."""
+        return self.image.window
 
     def weigh(self, part, geometry, masks):
         """Values and weights of some rows of the image.
@@ -368,7 +435,9 @@ class Frame:
             self.image.saturation,
             masks,
         )
-        weight = np.minimum(self.along_rows[first : first + part.rows], self.along_cols)
+        along_rows = falling(first + np.arange(part.rows), *self.known_rows)
+        along_cols = falling(np.arange(self.window.cols), *self.known_cols)
+        weight = np.minimum(along_rows[:, None], along_cols).astype(np.float32)
         weight[usable[inside] == 0] = 0.0
         return measured[inside], weight
 
@@ -402,29 +471,38 @@ def clipped(samples, first, last):
     return samples._replace(windows=windows, starts=starts)
 
 
-class ThinImages:
-    """At most about `THIN` pixels of each image, rows spread evenly; one image at a time.
+def _known_extent(image):
+    """First and number of the rows, and of the columns, that hold values."""
+    rows, cols = image.window.shape
+    in_row, in_col = np.zeros(rows, bool), np.zeros(cols, bool)
+    for first in range(0, rows, ROWS_AT_ONCE):
+        known = np.isfinite(image.measured[first : first + ROWS_AT_ONCE])
+        in_row[first : first + ROWS_AT_ONCE] = known.any(axis=1)
+        in_col |= known.any(axis=0)
+    return known_span(in_row), known_span(in_col)
+
+
+def _thin_brightness(image):
+    """Brightness of lit ground in an image, from some of its rows."""
+    return lit_brightness(thinned(image.measured))
+
+
+def thinned(measured):
+    """At most about `THIN` pixels of an image, rows spread evenly.
 
     Parameters
     ----------
-    observations : list of Observation
-    progress : callable
+    measured : array (rows, cols)
+        Or what waits on a disk and is indexed by rows as that.
+
+    Returns
+    -------
+    pixels : array
     """
-
-    def __init__(self, observations, progress):
-        self.images = [observation.measured for observation in observations]
-        self.progress = progress
-
-    def __len__(self):
-        """Number of images."""
-        return len(self.images)
-
-    def __iter__(self):
-        """The pixels of one image after the other, read anew where they wait on a disk."""
-        for measured in self.progress(self.images, "thresholds"):
-            step = max(1, -(-measured.shape[0] * measured.shape[1] // THIN))
-            rows = range(0, len(measured), step)
-            yield measured[:] if step == 1 else np.concatenate([measured[row] for row in rows])
+    step = max(1, -(-measured.shape[0] * measured.shape[1] // THIN))
+    if step == 1:
+        return measured[:]
+    return np.concatenate([measured[row] for row in range(0, len(measured), step)])
 
 
 def _strips(window, every):

@@ -4,25 +4,33 @@ Most callers want `run_albedo`.
 """
 
 import csv
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from lommel.estimate.albedo import estimate_albedo
+from lommel import __version__
+from lommel.estimate.albedo import collect, find_photometry, make_maps
 from lommel.estimate.albedo_quality import (
     brightness_ramp,
     shading_in_albedo,
     slope_towards_sun,
 )
 from lommel.estimate.albedo_settings import AlbedoSettings, published_settings
+from lommel.jobs import InThreads
 from lommel.progress import silent
 from lommel.run.albedo_plan import plan_albedo
 from lommel.run.albedo_products import Products
+from lommel.run.albedo_records import Kept, work_folder
 from lommel.run.inputs import GridSettings, SceneFiles, Skipped
-from lommel.run.mixed_scene import place_scene, raw_cameras, read_placed
+from lommel.run.mixed_scene import PlacedScene, place_scene, raw_cameras, read_placed
+from lommel.run.parts import Parts
 from lommel.run.products import RunRecord, output_folder
+from lommel.run.records import digest_of
 from lommel.run.register import settle_cameras
 from lommel.run.stored_rows import Held
+from lommel.run.tiles_engines import check_engine, open_engine
+from lommel.run.tiles_plan import Tiling
 
 SHARED_NAMES = ("phase_c1_per_rad", "phase_c2", "falloff_v2_per_rad2", "falloff_v4_per_rad4")
 
@@ -52,6 +60,40 @@ def albedo_settings(solver="projection", shadow_threshold=None, **changes):
     return replace(start, masks=replace(start.masks, shadow_threshold=shadow_threshold), **chosen)
 
 
+@dataclass(frozen=True)
+class AlbedoRun:
+    """What decides the products of a run: all that the jobs of an array have to be told.
+
+    Attributes
+    ----------
+    placed : PlacedScene
+    settings : AlbedoSettings
+    asked : dict
+        The settings as ``run.json`` shows them.
+    inputs : list of dict
+        Path, bytes and digest of each input file.
+    lost : list of Skipped
+        Images that could not be registered.
+    remark : str
+        On how raw images lie on the DEM.
+    version : str
+        Of the program.
+    """
+
+    placed: PlacedScene
+    settings: AlbedoSettings
+    asked: dict
+    inputs: list
+    lost: list
+    remark: str
+    version: str = __version__
+
+    @property
+    def digest(self):
+        """Of settings and inputs."""
+        return digest_of([self.asked, self.inputs])
+
+
 def run_albedo(
     files: SceneFiles,
     output,
@@ -60,7 +102,7 @@ def run_albedo(
     overwrite: bool = False,
     progress=silent,
     registers: bool = False,
-    memory: float | None = None,
+    tiling: Tiling | None = None,
 ):
     """Estimate albedo and exposures from orthoimages or raw images and write the products.
 
@@ -78,65 +120,117 @@ def run_albedo(
         Shows how far each step is; see `lommel.progress.silent`.
     registers : bool
         Register raw images to the DEM first; otherwise they are only checked.
-    memory : float, bytes, optional
-        As of `plan_albedo`; it does not change the products.
+    tiling : Tiling, optional
+        Memory and engine; they do not change the products.
 
     Returns
     -------
     results : dict of str to number
         As in ``run.json``.
     """
-    settings = settings or AlbedoSettings()
-    record = RunRecord(
-        "albedo",
-        asdict(settings)
-        | {"grid": asdict(grid_settings or GridSettings()), "registers": registers},
-    )
+    settings, tiling = settings or AlbedoSettings(), tiling or Tiling()
+    check_engine(tiling)
     with output_folder(output, overwrite) as folder:
-        with record.stage("read"):
-            tables = (files.sun_positions, files.spacecraft_positions)
-            inputs = [*files.images, *files.dems, *files.cameras, *filter(None, tables)]
-            record.add_inputs(inputs, progress)
-            settled, lost, remark = settle_cameras(
-                files, folder, registers, raw_cameras(files), progress
-            )
-            placed = place_scene(settled, grid_settings, progress=progress)
-            plan = plan_albedo(placed, settings, memory)
-            kept = _kept(plan, record, output)
-            scene = read_placed(placed, progress, kept.rows)
-        with record.stage("solve"), plan.limits(), Products(folder, scene.grid) as products:
-            result = estimate_albedo(
-                scene.observations,
-                scene.grid,
-                scene.heights,
-                settings,
-                progress,
-                products.take,
-                plan.kept_pixels,
-                kept.photometry,
-            )
-        with record.stage("write"):
-            names = [observation.name for observation in scene.observations]
-            reasons = zip(names, result.reasons, strict=True)
-            unused = [Skipped(name, f"{name}: {reason}") for name, reason in reasons if reason]
-            skipped = [*lost, *scene.skipped]
-            record.add_skipped([*skipped, *unused])
-            _write_exposures(folder / "exposures.csv", names, result, skipped)
-            record.results = _results(scene, result, products)
-        record.history = result.history
-        record.outcome = {"name": result.outcome, "sentence": result.advice + remark}
-        record.write(folder)
+        record = RunRecord("albedo", asked_for(settings, grid_settings, registers))
+        with record.stage("place"):
+            run = place_run(files, folder, settings, grid_settings, registers, record, progress)
+            plan = plan_albedo(run.placed, settings, tiling)
+            work = work_folder(output)
+            kept = Kept(work, run.digest) if plan.waits_on_disk else Held()
+            kept.begin(plan)
+        if plan.is_shared:
+            with open_engine(tiling) as engine:
+                jobs = Parts(work, run.digest, tiling, engine, plan.most_threads, progress)
+                write_products(run, plan, jobs, kept, folder, record)
+        else:
+            write_products(run, plan, InThreads(progress), kept, folder, record)
     kept.remove()
     return record.results
 
 
-def _kept(plan, record, output):
-    """Where images and photometry wait: in memory, or beside the output."""
-    if not plan.waits_on_disk:
-        return Held()
-    from lommel.run.albedo_records import Kept  # and what it needs to keep things
+def asked_for(settings, grid_settings=None, registers=False):
+    """The settings as ``run.json`` shows them."""
+    grid = asdict(grid_settings or GridSettings())
+    return asdict(settings) | {"grid": grid, "registers": registers}
 
-    return Kept(output, plan, record)
+
+def place_run(files, folder, settings, grid_settings, registers, record, progress):
+    """Look where images lie, and note what they are.
+
+    Parameters
+    ----------
+    files : SceneFiles
+    folder : Path
+        That registered cameras are written to.
+    settings : AlbedoSettings
+    grid_settings : GridSettings or None
+    registers : bool
+    record : RunRecord
+        That the inputs are noted in.
+    progress : callable
+
+    Returns
+    -------
+    run : AlbedoRun
+    """
+    tables = (files.sun_positions, files.spacecraft_positions)
+    inputs = [*files.images, *files.dems, *files.cameras, *filter(None, tables)]
+    record.add_inputs(inputs, progress)
+    settled, *lost = settle_cameras(files, folder, registers, raw_cameras(files), progress)
+    placed = place_scene(settled, grid_settings, progress=progress)
+    return AlbedoRun(placed, settings, dict(record.settings), list(record.inputs), *lost)
+
+
+def photometry_of(run, plan, jobs, kept):
+    """Read the images of a run and fit all but the maps.
+
+    Parameters
+    ----------
+    run : AlbedoRun
+    plan : AlbedoPlan
+    jobs : InThreads or Parts
+    kept : Held or Kept
+
+    Returns
+    -------
+    scene : Scene
+    fit : function ()
+        Gives `Problem` and `Photometry`.
+    """
+    scene = read_placed(run.placed, jobs, kept.rows)
+    names = [observation.name for observation in scene.observations]
+    remember = None if kept.photometry is None else partial(kept.photometry, names=names)
+    given = scene.observations, scene.grid, scene.heights, run.settings
+    return scene, partial(find_photometry, *given, jobs, plan.kept_pixels, remember)
+
+
+def write_products(run, plan, jobs, kept, folder, record):
+    """Do what a run asks for, and fill in its record.
+
+    Parameters
+    ----------
+    run, plan, jobs, kept
+        As of `photometry_of`.
+    folder : Path
+        That the products are written to.
+    record : RunRecord
+    """
+    with record.stage("read"):
+        scene, fit = photometry_of(run, plan, jobs, kept)
+    with record.stage("solve"), plan.limits(), Products(folder, scene.grid) as products:
+        problem, found = fit()
+        result = collect(problem, found, make_maps(problem, found), products.take)
+    with record.stage("write"):
+        names = [observation.name for observation in scene.observations]
+        reasons = zip(names, result.reasons, strict=True)
+        unused = [Skipped(name, f"{name}: {reason}") for name, reason in reasons if reason]
+        skipped = [*run.lost, *scene.skipped]
+        record.add_skipped([*skipped, *unused])
+        _write_exposures(folder / "exposures.csv", names, result, skipped)
+        record.results = _results(scene, result, products)
+    record.history = result.history
+    record.outcome = {"name": result.outcome, "sentence": result.advice + run.remark}
+    record.write(folder)
 
 
 def _write_exposures(path, names, result, skipped):

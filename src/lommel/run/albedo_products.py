@@ -4,7 +4,6 @@ Most callers want `Products`.
 """
 
 from contextlib import ExitStack
-from threading import Lock
 
 import numpy as np
 
@@ -35,7 +34,7 @@ class Products:
     """
 
     def __init__(self, folder, grid):
-        self.folder, self.grid, self.lock = folder, grid, Lock()
+        self.folder, self.grid = folder, grid
         rows, cols = grid.shape
         self.step = max(1, int(np.ceil(np.sqrt(rows * cols / THIN_POSTS))))
         shape = -(-rows // self.step), -(-cols // self.step)
@@ -70,7 +69,7 @@ class Products:
         return self.stack.__exit__(*error)
 
     def take(self, first, rows):
-        """Write and keep some rows; threads take turns."""
+        """Write and keep some rows."""
         size = len(rows.albedo)
         window = Window(first, 0, size, self.grid.shape[1])
         planes = {
@@ -79,9 +78,8 @@ class Products:
             "count": rows.count,
             "residual": 100.0 * rows.albedo_error / rows.albedo,
         }
-        with self.lock:
-            for name, values in planes.items():
-                self.writers[name](values, window)
+        for name, values in planes.items():
+            self.writers[name](values, window)
         every = -first % self.step
         start = (first + every) // self.step
         for name, part in vars(rows).items():

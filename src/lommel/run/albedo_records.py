@@ -5,15 +5,14 @@ is there whole or not at all, with the digest of what it was made from. Most cal
 """
 
 import os
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
 from lommel.estimate.albedo import Photometry
 from lommel.estimate.albedo_arrays import State
-from lommel.run.stored_rows import StoredRows
-from lommel.run.tiles_records import (
+from lommel.run.records import (
     clear_partial,
     digest_of,
     disk_errors,
@@ -24,24 +23,31 @@ from lommel.run.tiles_records import (
     remove_work,
     save_part,
 )
+from lommel.run.stored_rows import StoredRows
 
 
+@dataclass(frozen=True)
 class Kept:
     """Keeps what a run has found in a hidden folder, where the same request finds it again.
 
-    Parameters
+    Attributes
     ----------
-    output : path
-        Of the run.
-    plan : AlbedoPlan
-    record : RunRecord
-        Its settings and inputs tell whether what is there belongs to this request.
+    folder : Path
+        From `work_folder`.
+    digest : str
+        Of settings and inputs: it tells whether what is there belongs to this request.
     """
 
-    def __init__(self, output, plan, record):
-        self.folder = work_folder(output)
-        self.digest = digest_of([record.settings, record.inputs])
-        self.names: list[str] = []
+    folder: Path
+    digest: str
+
+    def begin(self, plan):
+        """Make the folder, if the disk has room for what it will hold.
+
+        Parameters
+        ----------
+        plan : AlbedoPlan
+        """
         with disk_errors(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
         clear_partial(self.folder)
@@ -56,12 +62,18 @@ class Kept:
                 with open(partial / "rows", "wb") as file:
                     for part in parts:
                         part.tofile(file)
-        self.names.append(name)
         return StoredRows(folder / "rows", shape)
 
-    def photometry(self, compute):
-        """What ``compute()`` gives, or has given to a run on the same images."""
-        folder, digest = self.folder / "photometry", digest_of([self.digest, self.names])
+    def photometry(self, compute, names):
+        """What ``compute()`` gives, or has given to a run on the same images.
+
+        Parameters
+        ----------
+        compute : function ()
+        names : list of str
+            Of the images.
+        """
+        folder, digest = self.folder / "photometry", digest_of([self.digest, names])
         if is_done(folder, digest):
             return _photometry(read_record(folder))
         found = compute()

@@ -6,6 +6,7 @@ their pixels and the DEM are then read some rows at a time (`read_placed`), in p
 depend on the memory there is. Most callers want `read_mixed_scene`.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,13 +16,13 @@ from lommel.errors import GeometryError, InputError, LommelError
 from lommel.io.cameras import find_camera
 from lommel.io.positions import find_position
 from lommel.io.raster import raster_info, read_image_on_grid
+from lommel.jobs import InThreads
 from lommel.progress import silent
 from lommel.run.inputs import (
     GridSettings,
     Scene,
     Skipped,
     choose_grid,
-    known_heights,
     listing,
     place_images,
     read_position_tables,
@@ -30,12 +31,13 @@ from lommel.run.inputs import (
 )
 from lommel.run.orthoproject import common_gsd, ortho_grid
 from lommel.run.raw_images import RawImage, Terrain, read_raw_images, show_pixels, view_window
-from lommel.run.stored_rows import Held
+from lommel.run.stored_rows import Held, stacked
 from lommel.scene.body import MOON
 from lommel.scene.geometry import Observation
 from lommel.scene.grid import Grid, Window
 
 POSTS_AT_ONCE = 2**21  # of terrain or of an orthoimage while it is read
+BANDS_TOGETHER = 8  # of terrain that another process reads at a time
 SQUARE = 768  # posts along each side of the parts of a raw image, 500 bytes each
 
 
@@ -92,7 +94,7 @@ class PlacedScene:
         return sum(window.rows * window.cols for window in windows)
 
 
-def read_mixed_scene(files, grid_settings=None, body=MOON, progress=silent, store=Held.rows):
+def read_mixed_scene(files, grid_settings=None, body=MOON):
     """Terrain, orthoimages and raw images on one grid.
 
     Parameters
@@ -100,15 +102,13 @@ def read_mixed_scene(files, grid_settings=None, body=MOON, progress=silent, stor
     files : SceneFiles
     grid_settings : GridSettings, optional
     body : Body
-    progress, store
-        As of `read_placed`.
 
     Returns
     -------
     scene : Scene
         The spacecraft of a line-scan image stands where it was at the middle line.
     """
-    return read_placed(place_scene(files, grid_settings, body, progress), progress, store)
+    return read_placed(place_scene(files, grid_settings, body))
 
 
 def place_scene(files, grid_settings=None, body=MOON, progress=silent):
@@ -158,14 +158,14 @@ def place_scene(files, grid_settings=None, body=MOON, progress=silent):
     return PlacedScene(grid, terrain, places, tables, skipped)
 
 
-def read_placed(placed, progress=silent, store=Held.rows):
+def read_placed(placed, jobs=None, store=Held.rows):
     """Terrain and images of a placed scene.
 
     Parameters
     ----------
     placed : PlacedScene
-    progress : callable
-        Shows how far each step is; see `lommel.progress.silent`.
+    jobs : InThreads, optional
+        Reads bands of the terrain and images.
     store : function (name, shape, parts)
         Puts the arrays of an iterator, which follow each other from north to south, together to one
         of a shape; `Held.rows` in memory.
@@ -174,42 +174,85 @@ def read_placed(placed, progress=silent, store=Held.rows):
     -------
     scene : Scene
     """
-    grid, skipped, observations = placed.grid, list(placed.skipped), []
-    heights = store("heights", grid.shape, _terrain_rows(placed, progress))
-    for number, place in enumerate(progress(placed.places, "images")):
-        try:
-            sun, craft, saturation = _circumstances(place, placed)
-            rows = _checked_rows(place, placed, heights)
-            measured = store(f"image-{number:05d}", place.window.shape, rows)
-        except (InputError, GeometryError) as error:  # a full disk is none of them
-            skipped.append(Skipped(place.path.name, str(error)))
-            continue
-        name = place.path.name
-        observations.append(Observation(name, place.window, measured, sun, craft, saturation))
+    jobs = jobs or InThreads()
+    common = replace(placed, places=[], skipped=[])  # a job needs no place but its own
+    grid, skipped = placed.grid, list(placed.skipped)
+    parts = list(bands(grid.window, max(1, POSTS_AT_ONCE // grid.shape[1])))
+    numbered = list(enumerate(parts))
+    found = jobs.each(ReadTerrain(common, store), numbered, "terrain", BANDS_TOGETHER, threads=1)
+    found = list(found)
+    if not any(is_known for _, is_known in found):
+        raise InputError(
+            "The DEM has no height inside the output grid. Check --bounds, and that DEM and "
+            "images show the same region."
+        )
+    heights = stacked([rows for rows, _ in found])
+    numbered = list(enumerate(placed.places))
+    images = list(jobs.each(ReadImage(common, store, heights), numbered, "images", threads=1))
+    skipped += [image for image in images if isinstance(image, Skipped)]
+    observations = [image for image in images if not isinstance(image, Skipped)]
     if not observations:
         raise InputError("No image can be used.\n" + listing(skipped))
     return Scene(grid, heights, observations, skipped)
+
+
+@dataclass(frozen=True)
+class ReadTerrain:
+    """Reads bands of the terrain.
+
+    Attributes
+    ----------
+    placed : PlacedScene
+    store : function
+        As of `read_placed`.
+    """
+
+    placed: PlacedScene
+    store: Callable
+
+    def __call__(self, item):
+        """Heights of a band and whether any is known, from its number and its window."""
+        number, part = item
+        rows = self.store(f"heights-{number:05d}", part.shape, self._heights(part))
+        return rows, bool(np.isfinite(rows[:]).any())
+
+    def _heights(self, part):
+        yield self.placed.terrain.heights(self.placed.grid.cut(part))
+
+
+@dataclass(frozen=True)
+class ReadImage:
+    """Reads images.
+
+    Attributes
+    ----------
+    placed : PlacedScene
+    store : function
+        As of `read_placed`.
+    heights : array (rows, cols), m
+        Or what waits on the disk.
+    """
+
+    placed: PlacedScene
+    store: Callable
+    heights: np.ndarray
+
+    def __call__(self, item):
+        """`Observation`, or `Skipped` where it cannot be used, from its number and its `Place`."""
+        number, place = item
+        try:
+            sun, craft, saturation = _circumstances(place, self.placed)
+            rows = _checked_rows(place, self.placed, self.heights)
+            measured = self.store(f"image-{number:05d}", place.window.shape, rows)
+        except (InputError, GeometryError) as error:  # a full disk is none of them
+            return Skipped(place.path.name, str(error))
+        return Observation(place.path.name, place.window, measured, sun, craft, saturation)
 
 
 def bands(window, rows):
     """Parts of a window of so many rows at most, all columns each, from north to south."""
     for first in range(0, window.rows, rows):
         yield replace(window, row=window.row + first, rows=min(rows, window.rows - first))
-
-
-def _terrain_rows(placed, progress):
-    """Heights of the grid, some rows at a time."""
-    parts = list(bands(placed.grid.window, max(1, POSTS_AT_ONCE // placed.grid.shape[1])))
-    is_known = False
-    for part in progress(parts, "terrain"):
-        heights = known_heights(placed.terrain.paths, placed.grid.cut(part), placed.terrain.body)
-        is_known |= bool(np.isfinite(heights).any())
-        yield heights
-    if not is_known:
-        raise InputError(
-            "The DEM has no height inside the output grid. Check --bounds, and that DEM and "
-            "images show the same region."
-        )
 
 
 def _circumstances(place, placed):

@@ -1,6 +1,6 @@
 """Images and terrain on the run's grid: held in memory, or waiting on the disk row by row.
 
-Most callers want `Held` and `StoredRows`.
+Most callers want `Held`, `StoredRows` and `stacked`.
 """
 
 from dataclasses import dataclass
@@ -16,6 +16,9 @@ class Held:
     """
 
     photometry = None
+
+    def begin(self, plan):
+        """Nothing is needed."""
 
     @staticmethod
     def rows(name, shape, parts):
@@ -42,18 +45,15 @@ class Held:
         """Nothing is left."""
 
 
-@dataclass(frozen=True)
-class StoredRows:
-    """An array in a file, read some rows at a time; it is indexed by rows as an array is.
+class Rows:
+    """Indexed by rows as an array is, some of them read at a time; for `StoredRows` and others.
 
     Attributes
     ----------
-    path : Path
     shape : tuple of int
         Rows and columns, float32.
     """
 
-    path: Path
     shape: tuple[int, int]
 
     def __len__(self):
@@ -66,6 +66,66 @@ class StoredRows:
         if not isinstance(rows, slice):
             return self[(slice(rows, rows + 1), *cols)][0]
         first, last, _ = rows.indices(len(self))
-        size, width = max(last - first, 0), self.shape[1]
+        return self._read(first, max(first, last))[(slice(None), *cols)]
+
+    def _read(self, first, last):
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class StoredRows(Rows):
+    """An array in a file.
+
+    Attributes
+    ----------
+    path : Path
+    shape : tuple of int
+    """
+
+    path: Path
+    shape: tuple[int, int]
+
+    def _read(self, first, last):
+        size, width = last - first, self.shape[1]
         values = np.fromfile(self.path, np.float32, size * width, offset=4 * first * width)
-        return values.reshape(size, width)[(slice(None), *cols)]
+        return values.reshape(size, width)
+
+
+@dataclass(frozen=True)
+class StackedRows(Rows):
+    """Arrays of the same width, one below the other.
+
+    Attributes
+    ----------
+    bands : tuple of StoredRows
+    """
+
+    bands: tuple[StoredRows, ...]
+
+    @property
+    def shape(self):
+        """Rows of all bands, and columns."""
+        return sum(len(band) for band in self.bands), self.bands[0].shape[1]
+
+    def _read(self, first, last):
+        parts, top = [], 0
+        for band in self.bands:
+            parts.append(band[max(first - top, 0) : max(last - top, 0)])
+            top += len(band)
+        return np.concatenate(parts)
+
+
+def stacked(bands):
+    """Arrays, or what waits on the disk, one below the other as one.
+
+    Parameters
+    ----------
+    bands : sequence of array or StoredRows
+
+    Returns
+    -------
+    values : array or StackedRows
+    """
+    if all(isinstance(band, StoredRows) for band in bands):
+        return StackedRows(tuple(bands))
+    return np.concatenate(bands)

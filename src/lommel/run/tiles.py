@@ -18,24 +18,21 @@ from lommel.estimate.priors import Priors
 from lommel.progress import silent
 from lommel.run.inputs import GridSettings
 from lommel.run.products import RunRecord, peak_memory_mb
-from lommel.run.tiles_engines import check_engine, solve_all
-from lommel.run.tiles_plan import Tiling, plan_tiles, work_folder
-from lommel.run.tiles_products import finish_products, size_on_disk
-from lommel.run.tiles_records import (
-    TiledRun,
+from lommel.run.records import (
     clear_partial,
     digest_of,
     disk_errors,
     is_done,
-    load_run,
-    part_folder,
     read_array,
     read_record,
     refuse_full,
     remove_work,
     save_part,
-    save_run,
 )
+from lommel.run.tiles_engines import check_engine, solve_all
+from lommel.run.tiles_plan import Tiling, plan_tiles, work_folder
+from lommel.run.tiles_products import finish_products, size_on_disk
+from lommel.run.tiles_records import TiledRun, load_run, part_folder, save_run
 from lommel.run.tiles_solve import Known, prepare_scene, solve_tile
 
 ARRAYS = [

@@ -1,8 +1,8 @@
-"""Tiles as tasks of a Dask cluster: one of this machine's own, or one that runs already.
+"""Tiles, and other parts of a run, as tasks of a Dask cluster of this machine, or one that runs.
 
-A worker has one tile at a time and computes it with as many threads as Dask gives the worker, so
-that workers times threads are the cores, however the cluster was started. Dask takes the tile of a
-worker that is lost to another. Most callers want `submitted`.
+A worker has one part at a time and computes it with as many threads as Dask gives the worker, so
+that workers times threads are the cores, however the cluster was started. Dask takes the part of a
+worker that is lost to another. Most callers want `connected`.
 """
 
 import logging
@@ -31,43 +31,41 @@ class OneTileAtATime(WorkerPlugin):
 
 
 @contextmanager
-def submitted(solve, work, numbers, tiling):
-    """Hand tiles to a cluster.
+def connected(tiling):
+    """A cluster to hand parts to.
 
     Parameters
     ----------
-    solve : function (work, number)
-        Found by its name on the workers.
-    work : Path
-        Folder of the tiles, on a disk that all workers see.
-    numbers : list of int
     tiling : Tiling
 
     Yields
     ------
-    results : list of function ()
-        Each waits for its tile and gives what ``solve`` gives. `LommelError` when the scheduler is
-        lost.
-    workers : int
-        How many there are now.
+    start : function (solve, work, numbers)
+        As of `lommel.run.tiles_engines.open_engine`; ``solve`` is found by its name on the workers,
+        and ``work`` is on a disk that all of them see. A result is a `LommelError` when the
+        scheduler is lost.
     """
     with _cluster(tiling) as cluster, _client(cluster) as client:
         client.register_plugin(OneTileAtATime())
-        run = uuid4().hex[:8]  # a tile that is tried again is a new task
-        futures = [
-            client.submit(
-                with_own_threads,
-                solve,
-                work,
-                number,
-                key=f"tile-{number}-{run}",
-                resources={TILE: 1},
-                pure=False,
-            )
-            for number in numbers
-        ]
-        results = [partial(_result, client, future, work) for future in futures]
-        yield results, max(len(client.nthreads()), 1)
+        yield partial(_submit, client)
+
+
+def _submit(client, solve, work, numbers):
+    run = uuid4().hex[:8]  # a part that is tried again is a new task
+    futures = [
+        client.submit(
+            with_own_threads,
+            solve,
+            work,
+            number,
+            key=f"{work.name}-{number}-{run}",
+            resources={TILE: 1},
+            pure=False,
+        )
+        for number in numbers
+    ]
+    results = [partial(_result, client, future, work) for future in futures]
+    return results, max(len(client.nthreads()), 1)
 
 
 def check_scheduler(address):
@@ -118,6 +116,6 @@ def _result(client, future, work):
         if client.status == "running":
             raise
         raise LommelError(
-            f"The Dask scheduler was lost while tiles were solved ({error}). Those that are done "
+            f"The Dask scheduler was lost ({error}). Parts that are done "
             f"wait in {work}: the same command, with a scheduler that runs, goes on from there."
         ) from error

@@ -1,4 +1,4 @@
-"""How the tiles of a scene are shared out: one after the other, to processes, or to Dask.
+"""How the parts of a run are shared out: one after the other, to processes, or to Dask.
 
 Jobs are a path and a number; arrays stay on the disk that all workers see. Most callers want
 `solve_all`.
@@ -6,7 +6,8 @@ Jobs are a path and a number; arrays stay on the disk that all workers see. Most
 
 import os
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from multiprocessing import get_context
 
@@ -26,34 +27,38 @@ def check_engine(tiling):
         _dask_module().check_scheduler(tiling.scheduler)
 
 
-def solve_all(solve, work, numbers, tiling, progress=silent):
-    """Solve tiles; those that fail are tried once more.
+def solve_all(solve, work, numbers, tiling, progress=silent, name="tiles", engine=None):
+    """Solve tiles, or other numbered parts; those that fail are tried once more.
 
-    Rounds go on while they finish tiles: a worker that dies takes others' tiles along.
+    Rounds go on while they finish parts: a worker that dies takes others' parts along.
 
     Parameters
     ----------
     solve : function (work, number)
         Gives the text of what went wrong, or None.
     work : Path
-        Folder of the tiles.
+        Folder of the parts.
     numbers : list of int
     tiling : Tiling
     progress : callable
         Shows how far each step is; see `lommel.progress.silent`.
+    name : str
+        Of the step.
+    engine : function, optional
+        From `open_engine`, where several steps share it.
 
     Returns
     -------
     failed : dict of int to str
-        Reasons of the tiles that failed twice.
+        Reasons of the parts that failed twice.
     """
-    engine = {"serial": _serial, "processes": _processes, "dask": _dask}[tiling.engine]
     pending, failed, finished, attempts = list(numbers), {}, 0, 0
-    while pending and (attempts < 2 or finished):
-        failed = {}
-        with engine(solve, work, pending, tiling) as (results, workers):
-            tiles = list(zip(pending, results, strict=True))
-            for number, result in progress(tiles, "tiles", at_once=workers):
+    with open_engine(tiling) if engine is None else nullcontext(engine) as start:
+        while pending and (attempts < 2 or finished):
+            failed = {}
+            results, workers = start(solve, work, pending)
+            parts = list(zip(pending, results, strict=True))
+            for number, result in progress(parts, name, at_once=workers):
                 try:
                     reason = result()
                 except LommelError:
@@ -62,35 +67,73 @@ def solve_all(solve, work, numbers, tiling, progress=silent):
                     reason = f"{type(error).__name__}: {error}"
                 if reason is not None:
                     failed[number] = reason
-        finished, pending, attempts = len(pending) - len(failed), list(failed), attempts + 1
+            finished, pending, attempts = len(pending) - len(failed), list(failed), attempts + 1
     return failed
 
 
 @contextmanager
-def _serial(solve, work, numbers, tiling):
-    yield [partial(solve, work, number) for number in numbers], 1
+def open_engine(tiling):
+    """Those who work.
+
+    Parameters
+    ----------
+    tiling : Tiling
+
+    Yields
+    ------
+    start : function (solve, work, numbers)
+        Gives functions without arguments that wait for one result each, and the number of workers.
+    """
+    if tiling.engine == "serial":
+        yield _serial
+    elif tiling.engine == "processes":
+        with _Processes(tiling.workers) as processes:
+            yield processes.start
+    else:
+        with _dask_module().connected(tiling) as start:
+            yield start
 
 
-@contextmanager
-def _processes(solve, work, numbers, tiling):
+def _serial(solve, work, numbers):
+    return [partial(solve, work, number) for number in numbers], 1
+
+
+class _Processes:
     """Workers of their own, who share the cores among them."""
-    before = os.environ.get("NUMBA_NUM_THREADS")
-    os.environ["NUMBA_NUM_THREADS"] = str(max(cores() // tiling.workers, 1))
-    try:
-        with ProcessPoolExecutor(tiling.workers, get_context("spawn")) as pool:
-            futures = [pool.submit(solve, work, number) for number in numbers]
-            yield [future.result for future in futures], tiling.workers
-    finally:
-        if before is None:
-            del os.environ["NUMBA_NUM_THREADS"]
-        else:
-            os.environ["NUMBA_NUM_THREADS"] = before
 
+    def __init__(self, workers):
+        self.workers = workers
+        self.pool = self._new_pool()
 
-@contextmanager
-def _dask(solve, work, numbers, tiling):
-    with _dask_module().submitted(solve, work, numbers, tiling) as submitted:
-        yield submitted
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.pool.shutdown(cancel_futures=True)
+
+    def start(self, solve, work, numbers):
+        """As of `open_engine`; workers that are lost are replaced."""
+        try:
+            futures = self._submit(solve, work, numbers)
+        except BrokenProcessPool:
+            self.pool = self._new_pool()
+            futures = self._submit(solve, work, numbers)
+        return [future.result for future in futures], self.workers
+
+    def _new_pool(self):
+        return ProcessPoolExecutor(self.workers, get_context("spawn"))
+
+    def _submit(self, solve, work, numbers):
+        """Workers begin here, and take the number of their threads from the environment."""
+        before = os.environ.get("NUMBA_NUM_THREADS")
+        os.environ["NUMBA_NUM_THREADS"] = str(max(cores() // self.workers, 1))
+        try:
+            return [self.pool.submit(solve, work, number) for number in numbers]
+        finally:
+            if before is None:
+                del os.environ["NUMBA_NUM_THREADS"]
+            else:
+                os.environ["NUMBA_NUM_THREADS"] = before
 
 
 def _dask_module():

@@ -13,9 +13,10 @@ import numpy as np
 from lommel.io.raster import raster_writer
 from lommel.progress import silent, step
 from lommel.run.inputs import Skipped
+from lommel.run.records import read_array, read_record
 from lommel.run.shape_from_shading import cell_grid, write_exposures
 from lommel.run.tiles_plan import blend_weights
-from lommel.run.tiles_records import part_folder, read_array, read_record
+from lommel.run.tiles_records import part_folder
 from lommel.run.tiles_settle import settle_tiles
 from lommel.run.tiles_solve import at_posts, stored_window
 

@@ -6,8 +6,9 @@ Most callers want `settle_tiles`.
 import numpy as np
 
 from lommel.estimate.long_waves import Part, Remainder, settle
+from lommel.run.records import read_array, read_record
 from lommel.run.tiles_plan import blend_weights
-from lommel.run.tiles_records import part_folder, read_array, read_record
+from lommel.run.tiles_records import part_folder
 from lommel.scene.grid import Window
 
 

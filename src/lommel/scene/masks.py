@@ -129,10 +129,24 @@ def shadow_thresholds(images, settings):
     if settings.shadow_threshold is not None:
         return np.full(len(images), float(settings.shadow_threshold))
     lit = np.array([lit_brightness(image) for image in images])
-    least = DARK_IMAGE * np.median(lit) if images else 0.0
+    least = least_lit(lit)
     return np.array(
         [shadow_threshold(image, max(own, least)) for image, own in zip(images, lit, strict=True)]
     )
+
+
+def least_lit(lit):
+    """Least brightness of lit ground in any of many images, from that of each; 0 without images.
+
+    Parameters
+    ----------
+    lit : sequence of float, image units
+
+    Returns
+    -------
+    least : float, image units
+    """
+    return DARK_IMAGE * float(np.median(lit)) if len(lit) else 0.0
 
 
 def feathering(shape, valid=None):
@@ -158,13 +172,42 @@ def feathering(shape, valid=None):
     """
     along = []
     for axis in (0, 1):
-        used = np.arange(shape[axis])
-        if valid is not None and valid.any():
-            used = np.flatnonzero(valid.any(axis=1 - axis))
-        first, size = used[0], used[-1] - used[0] + 1
-        centred = (2.0 * (np.arange(shape[axis]) - first) + 1.0) / size - 1.0
-        along.append(np.clip(1.0 - np.abs(centred), 0.0, 1.0))
+        is_known = np.ones(shape[axis], bool) if valid is None else valid.any(axis=1 - axis)
+        along.append(falling(np.arange(shape[axis]), *known_span(is_known)))
     return np.minimum(along[0][:, None], along[1][None, :]).astype(np.float32)
+
+
+def known_span(is_known):
+    """First known place along one side of an image, and how far it is to behind the last one.
+
+    Parameters
+    ----------
+    is_known : bool array (n,)
+
+    Returns
+    -------
+    first, size : int
+        All of the side where nothing is known.
+    """
+    known = np.flatnonzero(is_known)
+    return (int(known[0]), int(known[-1] - known[0] + 1)) if known.size else (0, len(is_known))
+
+
+def falling(places, first, size):
+    """Weights along one side that fall from 1 in the middle to 0 at both ends.
+
+    Parameters
+    ----------
+    places : int array (n,), pixels
+    first, size : int, pixels
+        Where the side begins, and its length.
+
+    Returns
+    -------
+    weights : float64 array (n,)
+    """
+    centred = (2.0 * (places - first) + 1.0) / size - 1.0
+    return np.clip(1.0 - np.abs(centred), 0.0, 1.0)
 
 
 def pixel_weights(measured, cos_incidence, cos_emission, threshold, saturation, settings):

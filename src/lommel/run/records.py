@@ -1,0 +1,196 @@
+"""Parts of a run on the disk, each whole or not at all, so that a run can be broken off.
+
+A part is a folder with arrays or other files and ``record.json``, which takes its name when it is
+whole. It counts as done when its record carries the digest of what it was made from. Several
+processes, also of several machines, may work in the same folder. Most callers want `save_part` and
+`is_done`.
+"""
+
+import hashlib
+import json
+import os
+import pickle
+import shutil
+import socket
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from lommel import __version__
+from lommel.errors import LommelError
+
+RUN = "run.pickle"  # pickled, as the folder belongs to the user as compiled code does
+
+
+def write_whole(path, content):
+    """Write a file that appears whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+    content : bytes
+    """
+    partial = path.with_name(f".{path.name}.{_me()}.partial")
+    try:
+        partial.write_bytes(content)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def load_pickled(path):
+    """An object with the ``version`` of the program that has pickled it.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    content : object
+        `LommelError` as of `load_run`.
+    """
+    try:
+        content = pickle.loads(path.read_bytes())
+        if content.version != __version__:
+            raise LommelError(
+                f"{path} was prepared by lommel {content.version}, this is {__version__}. Use one "
+                "version on all machines, or prepare anew."
+            )
+    except OSError as error:
+        raise LommelError(
+            f"{path} cannot be read ({error.strerror}). All workers must see the folder of the "
+            "output, on a shared disk, and the run must have been prepared."
+        ) from error
+    except (pickle.PickleError, EOFError, AttributeError, ImportError, IndexError) as error:
+        raise LommelError(f"{path} is damaged ({error}). Prepare the run anew.") from error
+    return content
+
+
+def digest_of(content):
+    """Digest of settings, inputs and whatever else decides what a part holds.
+
+    Parameters
+    ----------
+    content : object
+        That JSON can hold; other values count by their text.
+
+    Returns
+    -------
+    digest : str
+    """
+    text = json.dumps([__version__, content], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def save_part(folder, arrays, record):
+    """Write a part; it appears whole or not at all.
+
+    Parameters
+    ----------
+    folder : Path
+    arrays : dict of str to array
+    record : dict
+        With ``digest``.
+    """
+    with new_part(folder, record) as partial:
+        for name, values in arrays.items():
+            np.save(partial / f"{name}.npy", values, allow_pickle=False)
+
+
+@contextmanager
+def new_part(folder, record):
+    """The same for what the block writes into the folder that it is given.
+
+    Parameters
+    ----------
+    folder : Path
+    record : dict
+        With ``digest``.
+
+    Yields
+    ------
+    partial : Path
+    """
+    partial = folder.with_name(f".{folder.name}.{_me()}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        yield partial
+        (partial / "record.json").write_text(json.dumps(record, default=_plain), encoding="utf-8")
+        shutil.rmtree(folder, ignore_errors=True)
+        try:
+            partial.rename(folder)
+        except OSError:
+            if not is_done(folder, record["digest"]):  # by another worker, who was as quick
+                raise
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def read_record(folder):
+    """The record of a part; empty when there is none or it cannot be read."""
+    try:
+        record = json.loads((Path(folder) / "record.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return record if isinstance(record, dict) else {}
+
+
+def is_done(folder, digest):
+    """True when the part exists and was made from the same settings and inputs."""
+    return read_record(folder).get("digest") == digest
+
+
+def read_array(folder, name):
+    """An array of a part, read from disk as it is used."""
+    return np.load(Path(folder) / f"{name}.npy", mmap_mode="r", allow_pickle=False)
+
+
+def clear_partial(folder):
+    """Remove what a process that was killed has left unfinished."""
+    for partial in Path(folder).glob(".*.partial"):
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def remove_work(folder):
+    """Remove a run's tiles when its products are written."""
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def disk_errors(folder):
+    """Tell what a disk refuses, in words."""
+    try:
+        yield
+    except OSError as error:
+        free = shutil.disk_usage(next(f for f in (folder, *folder.parents) if f.exists())).free
+        raise LommelError(
+            f"{folder} cannot be written: {error.strerror or error}; {free / 1e6:.1f} MB of its "
+            "disk are free. Make space; what is done is kept, and the same command goes on."
+        ) from error
+
+
+def refuse_full(folder, size):
+    """Refuse to compute what the disk cannot take.
+
+    Parameters
+    ----------
+    folder : Path
+    size : int, bytes
+    """
+    free = shutil.disk_usage(folder).free
+    if free < size:
+        raise LommelError(
+            f"the disk of {folder} has {free / 1e6:.1f} MB free, {size / 1e6:.1f} MB are needed"
+        )
+
+
+def _me():
+    """Name of this process among those of all machines."""
+    return f"{socket.gethostname()}.{os.getpid()}"
+
+
+def _plain(value):
+    return value.tolist() if hasattr(value, "tolist") else str(value)
