@@ -516,7 +516,7 @@ def test_camera_of_an_unknown_kind_is_an_error(raw, lommel):
 
 SOLVERS = {
     "sfs": "lommel.run.shape_from_shading.solve_surface",
-    "albedo": "lommel.run.albedo.estimate_albedo",
+    "albedo": "lommel.run.albedo.find_photometry",
 }
 
 
