@@ -13,6 +13,7 @@ from lommel.core.multigrid import (
     dot,
 )
 from lommel.core.normal_operator import coarse_shape, restrict
+from lommel.core.plane import remove_plane
 
 STOP = 1e-4  # reduction of the preconditioned residual
 ONE_IMAGE_CYCLES = 24  # measured 15 at every size; twice that would be a regression
@@ -53,6 +54,25 @@ def test_a_terrain_that_is_known_well_does_not_slow_the_solver(mass):
     _, solution = solve(scene(256, 1, mass=mass))
     assert solution.reduction <= STOP
     assert solution.iterations <= ONE_IMAGE_CYCLES
+
+
+@pytest.mark.parametrize("images", [1, 4])
+def test_the_best_surface_with_the_plane_kept_is_found_as_fast(images):
+    equations = scene(129, images)
+    right = np.random.default_rng(1).normal(size=equations.shape).astype(np.float32)
+    free = conjugate_gradients(equations, right, STOP, 100).iterations
+    solution = conjugate_gradients(equations, right, STOP, 100, keeps_plane=True)
+    x, left = solution.x.copy(), np.empty_like(right)
+    assert solution.iterations <= free + 2
+    flat = x.copy()
+    remove_plane(flat)
+    np.testing.assert_allclose(x, flat, atol=1e-5 * np.abs(x).max())
+    equations.apply(x, left)
+    left -= right
+    only_planes = left.copy()
+    remove_plane(only_planes)  # at the minimum only planes are left of the gradient
+    preconditioned = equations.precondition(only_planes)
+    assert dot(only_planes, preconditioned) < (3 * STOP) ** 2 * dot(right, x)
 
 
 def test_four_images_give_back_the_surface():

@@ -31,6 +31,7 @@ from lommel.core.normal_operator import (
     prolong_add,
     restrict,
 )
+from lommel.core.plane import remove_plane
 
 # Degree of the Chebyshev polynomial before and after each coarse visit, doubled from level to
 # level, and the share of the spectrum it leaves to the next one, times the degree squared. With one
@@ -206,7 +207,9 @@ class LinearSolution:
     reduction: float
 
 
-def conjugate_gradients(equations, right_hand_side, tolerance, max_iterations):
+def conjugate_gradients(
+    equations, right_hand_side, tolerance, max_iterations, keeps_plane=False
+):
     """Solve ``A x = right_hand_side`` from zero.
 
     Parameters
@@ -216,15 +219,29 @@ def conjugate_gradients(equations, right_hand_side, tolerance, max_iterations):
     tolerance : float
         Reduction of sqrt(residual . preconditioned residual) to stop at.
     max_iterations : int
+    keeps_plane : bool
+        Solve among all ``x`` without mean and mean tilt.
 
     Returns
     -------
     solution : LinearSolution
     """
+
+    def precondition(residual):
+        """One V-cycle, from and to the fields that are allowed."""
+        if not keeps_plane:
+            return equations.precondition(residual)
+        with threads_for(residual.shape):
+            remove_plane(residual)
+        preconditioned = equations.precondition(residual)
+        with threads_for(residual.shape):
+            remove_plane(preconditioned)
+        return preconditioned
+
     residual, x, direction, image = equations.vectors
     np.copyto(residual, right_hand_side)
     x[:] = 0.0
-    preconditioned = equations.precondition(residual)
+    preconditioned = precondition(residual)
     np.copyto(direction, preconditioned)
     energy = start = dot(residual, preconditioned)
     if not start > 0:
@@ -240,7 +257,7 @@ def conjugate_gradients(equations, right_hand_side, tolerance, max_iterations):
             _take_step(x, residual, direction, image, np.float32(energy / bending))
         # zero in exact arithmetic; subtracting it keeps directions conjugate in float32
         overlap = dot(residual, preconditioned)
-        preconditioned = equations.precondition(residual)
+        preconditioned = precondition(residual)
         last, energy = energy, dot(residual, preconditioned)
         if not energy > tolerance**2 * start:
             break

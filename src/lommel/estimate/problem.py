@@ -67,6 +67,24 @@ class Quadratic:
     albedo: np.ndarray
 
 
+@dataclass(frozen=True)
+class Surroundings:
+    """The surface that a part of a scene is cut out of, on every so manieth post.
+
+    Attributes
+    ----------
+    u : float32 array (rows, cols), m
+    place : int64 array (3,)
+        Row and column of the part's first post in the scene; posts per post of ``u``.
+    """
+
+    u: np.ndarray
+    place: np.ndarray
+
+
+NOTHING_AROUND = Surroundings(np.empty((0, 0), np.float32), np.array([0, 0, 1]))
+
+
 @dataclass
 class Problem:
     """One level of the coarse-to-fine hierarchy."""
@@ -90,7 +108,7 @@ class Problem:
     pins: np.ndarray | None = None
     pinned: np.ndarray | None = None
     shadows: list = field(default_factory=list)
-    outside: np.ndarray | None = None
+    around: Surroundings | None = None
     brightness: np.ndarray | None = None
     geometry: list = field(default_factory=list)
     memory: dict = field(default_factory=dict)
@@ -139,7 +157,7 @@ class Problem:
         lattice, _, _, gram, lights = self.geometry
         shape = self.albedo.shape
         tensors, gradient = self._array("tensors", (3, *shape)), self._array("slopes", (2, *shape))
-        is_free = self.albedo_error > 0
+        is_free = self.frees_albedo
         best = self.albedo
         if is_free:
             spare = self._array("albedo", shape)
@@ -167,6 +185,31 @@ class Problem:
                 self.coupling if self.couples_albedo else NOT_COUPLED,
             )
         return tensors, gradient, sums, best, albedo_cost
+
+    @property
+    def frees_albedo(self):
+        """True where each cell's albedo is eliminated from the equations."""
+        return self.albedo_error > 0
+
+    def share_scale(self):
+        """Give exposures the scale that an albedo expected to be 1 has taken up."""
+        if self.frees_albedo:
+            scale = self._albedo_scale()
+            self.albedo /= np.float32(scale)
+            self.exposures *= scale
+
+    def scale_gain(self):
+        """By how much twice the cost falls with `share_scale`."""
+        if not self.frees_albedo:
+            return 0.0
+        total, scale = self.albedo.sum(dtype=float), self._albedo_scale()
+        # of the sum of (A - 1)^2, and of (A / scale - 1)^2
+        gain = total * (scale - 1) - total * (1 - 1 / scale)
+        return gain * self.stride**2 / self.albedo_error**2
+
+    def _albedo_scale(self):
+        """Factor by which an albedo is too large to be nearest to 1."""
+        return dot(self.albedo, self.albedo) / self.albedo.sum(dtype=float)
 
     @property
     def coupling(self):
@@ -226,8 +269,8 @@ class Problem:
         mean = (s_row * s_col) ** 0.5
         self.weights = np.asarray(priors.noise, float) ** -2.0
         curvature = np.array([1 / s_col**2, 2 / mean**2, 1 / s_row**2]) / priors.roughness**2
-        brightness = np.array([np.nanmean(cells) for cells in self.cells])
-        blur = (priors.albedo_contrast * np.median(brightness / priors.noise)) ** 2
+        signal = np.median(self.typical_brightness() / priors.noise)
+        blur = (priors.albedo_contrast * signal) ** 2
         self.curvature = curvature.astype(np.float32)
         self.slope = (blur * curvature[[0, 2]]).astype(np.float32)
         self.masses = np.asarray(priors.dem_errors, float) ** -2.0
@@ -321,22 +364,36 @@ class Problem:
         for cells, shadow in zip(self.cells, self.shadows, strict=False):
             cells[shadow] = np.nan
 
+    def typical_brightness(self):
+        """Median of each image, image units: of the whole scene where that is known."""
+        if self.brightness is None:
+            self.brightness = np.array([np.nanmedian(cells[::4, ::4]) for cells in self.cells])
+        return self.brightness
+
     def find_shadows(self, u):
         """Blank the cells that terrain shadows, where the images are dark there as well."""
         lattice, at_nodes, frame, _, _ = self.geometry
+        around = self.around or NOTHING_AROUND
+        highest = max(u.max(), around.u.max(initial=-np.inf))
         for k, (view, cells) in enumerate(zip(self.views, self.cells, strict=True)):
             to_sun = unit(view.sun_position - frame.xyz)
             sine = np.einsum("...i,...i", to_sun, frame.up)
             lateral = to_sun / np.maximum(sine, LOWEST_SUN)[..., None] - frame.up
             rays = self.surface.posts_crossed(lattice, at_nodes, lateral).astype(np.float32)
             shadow = np.empty(cells.shape, np.bool_)
-            known = self.brightness
-            middle = np.nanmedian(cells[::4, ::4]) if known is None else known[k]
-            darkest = np.float32(DARK * middle)
+            darkest = np.float32(DARK * self.typical_brightness()[k])
             with threads_for(u.shape):
-                cast_shadow(u, rays, lattice.step, u.max(), cells, darkest, shadow)
-            if self.outside is not None:
-                shadow |= self.outside[k] & (cells <= darkest)
+                cast_shadow(
+                    u,
+                    rays,
+                    lattice.step,
+                    around.u,
+                    around.place,
+                    highest,
+                    cells,
+                    darkest,
+                    shadow,
+                )
             self.shadows.append(widened(shadow))
             cells[self.shadows[-1]] = np.nan
 
@@ -350,6 +407,7 @@ class Problem:
             hazes=self.hazes[k : k + 1],
             weights=self.weights[k : k + 1],
             cells=self.cells[k : k + 1],
+            brightness=None if self.brightness is None else self.brightness[k : k + 1],
             geometry=[*geometry, lights[k : k + 1]],
             memory={},
         )
@@ -361,7 +419,7 @@ class Problem:
             exposures=self.exposures.copy(),
             stride=2 * self.stride,
             shadows=[],
-            outside=None,
+            around=None,
             memory={},
             initial=coarse_posts(self.initial),
             expected=coarse_posts(self.expected),
@@ -514,7 +572,7 @@ def _binomial(posts):
     return posts
 
 
-def best_photometry(sums, exposures, hazes, estimate_haze):
+def best_photometry(sums, exposures, hazes, estimate_haze, keeps_scale=False):
     """Exposures, and hazes if asked for, that fit the images best.
 
     Parameters
@@ -525,6 +583,8 @@ def best_photometry(sums, exposures, hazes, estimate_haze):
         As they are; kept where an image has no data.
     estimate_haze : bool
         With an expectation of 0 and a standard error of `HAZE_ERROR` of the mean brightness.
+    keeps_scale : bool
+        Only ratios of exposures change: their common scale is what an albedo that is free takes up.
 
     Returns
     -------
@@ -532,28 +592,39 @@ def best_photometry(sums, exposures, hazes, estimate_haze):
     """
     w, f, ff, fm, m = (sums[:, column] for column in (SUM_W, SUM_F, SUM_FF, SUM_FM, SUM_M))
     has_data = (ff > 0) & (m > 0)
-    if not estimate_haze:
-        best = (fm - hazes * f) / np.where(has_data, ff, 1)
-        return np.where(has_data, best, exposures), hazes
-    pull = (w / np.where(has_data, HAZE_ERROR * m, 1)) ** 2
-    determinant = np.where(has_data, ff * (w + pull) - f**2, 1)
-    haze = (ff * m - f * fm) / determinant
-    exposure = (fm * (w + pull) - f * m) / determinant
-    return np.where(has_data, exposure, exposures), np.where(has_data, haze, hazes)
+    if estimate_haze:
+        pull = (w / np.where(has_data, HAZE_ERROR * m, 1)) ** 2
+        determinant = np.where(has_data, ff * (w + pull) - f**2, 1)
+        haze = (ff * m - f * fm) / determinant
+        hazes = np.where(has_data, haze, hazes)
+        exposure = (fm * (w + pull) - f * m) / determinant
+    else:
+        exposure = (fm - hazes * f) / np.where(has_data, ff, 1)
+    exposure = np.where(has_data, exposure, exposures)
+    if keeps_scale:
+        exposure = exposures * (1 + _ratios(exposure / exposures - 1, exposures**2 * ff))
+    return exposure, hazes
 
 
-def exposure_gain(sums, exposures, hazes):
+def exposure_gain(sums, exposures, hazes, keeps_scale=False):
     """By how much twice the cost falls when each exposure takes its best value.
 
     Parameters
     ----------
     sums : float64 array (images, 8)
     exposures, hazes : array (images,)
+    keeps_scale : bool
+        As of `best_photometry`.
 
     Returns
     -------
     gain : float
     """
-    ff = sums[:, SUM_FF]
-    slope = sums[:, SUM_FM] - exposures * ff - hazes * sums[:, SUM_F]
-    return float((slope**2 / np.where(ff > 0, ff, np.inf)).sum())
+    weights = exposures**2 * sums[:, SUM_FF]
+    best, _ = best_photometry(sums, exposures, hazes, False, keeps_scale)
+    return float((weights * (best / exposures - 1) ** 2).sum())
+
+
+def _ratios(change, weights):
+    """Relative changes without the one that all images have in common."""
+    return change - (weights @ change) / max(weights.sum(), np.finfo(float).tiny)

@@ -116,7 +116,7 @@ def slide_along(step, u, planes, lattice_step):
 
 
 @njit(cache=True, parallel=True, fastmath=FAST)
-def cast_shadow(u, planes, step, highest, cells, darkest, out):
+def cast_shadow(u, planes, step, around, place, highest, cells, darkest, out):
     """True on dark cells from which the way to the Sun meets terrain.
 
     Parameters
@@ -126,8 +126,14 @@ def cast_shadow(u, planes, step, highest, cells, darkest, out):
         Rows and columns that the way to the Sun crosses per metre of rise.
     step : int
         Cells from node to node.
+    around : float32 array (rows, cols), m
+        Every so manieth post of a larger surface, which shadow is followed on beyond the ends of
+        ``u``; of no rows where there is none.
+    place : int64 array (3,)
+        Row and column of the first post of ``u`` among those of the larger surface at full
+        resolution, and the posts of that per post of ``around``.
     highest : float, m
-        Of the whole surface: above it nothing casts shadow.
+        Of both surfaces: above it nothing casts shadow.
     cells : float32 array (rows - 1, cols - 1), image units
     darkest : float, image units
         Cells that are brighter are not in shadow, whatever the terrain says.
@@ -140,12 +146,12 @@ def cast_shadow(u, planes, step, highest, cells, darkest, out):
         expand_row(planes[1], (r + 0.5) / step, step, at[1])
         for c in range(out.shape[1]):
             out[r, c] = cells[r, c] <= darkest and _meets_terrain(
-                u, r, c, at[0, c], at[1, c], highest
+                u, r, c, at[0, c], at[1, c], around, place, highest
             )
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=FAST)
-def _meets_terrain(u, r, c, per_metre_row, per_metre_col, highest):
+def _meets_terrain(u, r, c, per_metre_row, per_metre_col, around, place, highest):
     """Follow the ray from a cell's centre, one post along the longer axis at a time."""
     half, quarter = np.float32(0.5), np.float32(0.25)
     length = max(abs(per_metre_row), abs(per_metre_col))
@@ -157,12 +163,30 @@ def _meets_terrain(u, r, c, per_metre_row, per_metre_col, highest):
     row, col = r + half, c + half
     while True:
         row, col, height = row + d_row, col + d_col, height + rise
-        inside = 0 <= row and 0 <= col and row <= u.shape[0] - 1 and col <= u.shape[1] - 1
-        if not inside or height > highest:
+        if height > highest:
             return False
-        i, j = min(np.int64(row), u.shape[0] - 2), min(np.int64(col), u.shape[1] - 2)
-        v, h = np.float32(row - i), np.float32(col - j)
-        upper = u[i, j] + h * (u[i, j + 1] - u[i, j])
-        lower = u[i + 1, j] + h * (u[i + 1, j + 1] - u[i + 1, j])
-        if upper + v * (lower - upper) > height:
+        if _holds(u, row, col):
+            ground = _ground(u, row, col)
+        else:
+            far_row, far_col = (row + place[0]) / place[2], (col + place[1]) / place[2]
+            if not _holds(around, far_row, far_col):
+                return False
+            ground = _ground(around, far_row, far_col)
+        if ground > height:
             return True
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath=FAST)
+def _holds(u, row, col):
+    """Whether a place lies on a surface."""
+    return 0 <= row and 0 <= col and row <= u.shape[0] - 1 and col <= u.shape[1] - 1
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath=FAST)
+def _ground(u, row, col):
+    """Height of a surface between its posts."""
+    i, j = min(np.int64(row), u.shape[0] - 2), min(np.int64(col), u.shape[1] - 2)
+    v, h = np.float32(row - i), np.float32(col - j)
+    upper = u[i, j] + h * (u[i, j + 1] - u[i, j])
+    lower = u[i + 1, j] + h * (u[i + 1, j + 1] - u[i + 1, j])
+    return upper + v * (lower - upper)

@@ -31,23 +31,31 @@ from lommel.core.least_squares import (
     more_damping,
     stiffen,
 )
-from lommel.core.multigrid import NormalEquations, conjugate_gradients, dot
+from lommel.core.multigrid import NormalEquations, conjugate_gradients, dot, threads_for
 from lommel.core.normal_operator import prolong_add
+from lommel.core.plane import remove_plane
 from lommel.estimate.albedo_field import (
     albedo_information,
     fit_albedo,
     observed_contrast,
 )
-from lommel.estimate.long_waves import Remainder, remainder, without_tilt
+from lommel.estimate.long_waves import Remainder, remainder
 from lommel.estimate.priors import Priors, PriorSettings, estimate_priors
-from lommel.estimate.problem import best_photometry, coarse_posts, exposure_gain, fresh_problem
+from lommel.estimate.problem import (
+    Surroundings,
+    best_photometry,
+    coarse_posts,
+    exposure_gain,
+    fresh_problem,
+)
 from lommel.estimate.shading_kernels import SUM_COUNT, SUM_RR
 from lommel.estimate.surface_and_albedo import solve_jointly
 
 COARSEST = 24  # posts along the shorter side of the coarsest level that sees the images
+SETTLED = 0.1  # gain, relative to the cost, below which a surface moves shadows no more
 COARSE_STEPS = 4  # Gauss-Newton steps per coarse level at most; 2 on the largest of them
 ENOUGH_CELLS = 100_000  # of them tell a correlation to (1 - r^2) 0.3 %
-EXPOSURE_GAIN = 1e-4  # relative, of the cost: exposures that gain less wait for the next step
+EXPOSURE_GAIN = 0.01  # of twice the cost: exposures off by a tenth of their standard error
 EXPLAINED = 0.5  # noise standard errors, rms: a surface that leaves less leaves nothing to albedo
 # Where interpolation hides how far a DEM errs, albedo cannot be read off the images beforehand:
 # units that differ by a tenth or two border on each other over some ten posts
@@ -84,8 +92,8 @@ class SolverSettings:
     """
 
     max_steps: int = 8
-    step_tolerance: float = 0.005
-    gain_tolerance: float = 1e-3
+    step_tolerance: float = 0.001
+    gain_tolerance: float = 1e-5
     cycle_tolerance: float = 0.2
     max_cycles: int = 40
     estimate_exposure: bool = True
@@ -116,8 +124,6 @@ class SurfaceSolution:
         How well albedo and slope can be told apart, 0 to 1; see `separation`.
     priors : Priors
         As estimated or given.
-    shadows : list of bool array (rows - 1, cols - 1)
-        Cells of each image that terrain shadows.
     left : Remainder or None
         What a part leaves to the long waves of the whole scene.
     """
@@ -132,7 +138,6 @@ class SurfaceSolution:
     misfits: np.ndarray
     separation: np.ndarray
     priors: Priors
-    shadows: list
     left: Remainder | None = None
 
 
@@ -153,10 +158,12 @@ class Start:
         parts alike, whether there is something left for albedo.
     own : tuple of slice
         Posts that are this part's and no other's.
-    shadows : bool array (images, rows - 1, cols - 1)
-        Where the terrain of the whole scene casts shadow, also from outside.
+    around : Surroundings
+        The coarser surface of the whole scene, which casts shadow from outside.
     brightness : array (images,), image units
         Medians over the whole scene: a part may lie in shadow for the most.
+    frees_exposures : bool
+        The whole scene may still change the exposures, which a part holds fixed.
     """
 
     u: np.ndarray
@@ -164,8 +171,9 @@ class Start:
     hold: np.ndarray
     misfits: np.ndarray
     own: tuple[slice, slice]
-    shadows: np.ndarray
+    around: Surroundings
     brightness: np.ndarray
+    frees_exposures: bool
 
 
 def solve_surface(
@@ -212,7 +220,7 @@ def solve_surface(
         settings = replace(settings, estimate_exposure=False, estimate_haze=False)
     finest = fresh_problem(surface, initial, views, model, albedo)
     if start is not None:
-        finest.outside, finest.brightness = start.shadows, start.brightness
+        finest.around, finest.brightness = start.around, start.brightness
     finest.see(finest.initial)
     if photometry is None:
         # a blurred DEM explains part of the contrast only: haze would seem to explain the rest
@@ -252,7 +260,7 @@ def solve_surface(
         sums = finest.assemble(u)[2]
     else:
         here = replace(finest, pins=None, pinned=None).expand(u)
-        left_over = remainder(finest, here, u, start.own, start.stride.bit_length() - 1)
+        left_over = remainder(finest, here, u, start.own, start.stride, start.frees_exposures)
         sums = here.sums
     misfits = np.sqrt(sums[:, SUM_RR] / np.maximum(sums[:, SUM_COUNT], 1))
     left = misfits if start is None else start.misfits
@@ -270,7 +278,6 @@ def solve_surface(
         misfits,
         separation(finest, u),
         priors,
-        finest.shadows,
         left_over,
     )
     names = [view.name for view in views]
@@ -331,7 +338,8 @@ def _coarse_to_fine(finest, settings, history, start=None):
             correction = np.zeros_like(level.initial)
             prolong_add(u - coarse.initial, correction)
             if settings.estimate_exposure:
-                correction = without_tilt(correction)
+                with threads_for(correction.shape):
+                    remove_plane(correction)
             u = level.initial + correction
             level.exposures, level.hazes = coarse.exposures, coarse.hazes
         if level is finest:
@@ -346,6 +354,7 @@ def _coarse_to_fine(finest, settings, history, start=None):
 def _descend(level, u, steps, settings, history):
     """Gauss-Newton steps on one level, damped (Levenberg) where the cost would rise."""
     here, last_gain, damping, equations = level.expand(u), 0.0, 0.0, None
+    knows_shadows = level.stride > 1
     for _ in range(steps):
         last, start = _best_cost(here, level, settings), u
         for _ in range(ATTEMPTS):
@@ -359,11 +368,15 @@ def _descend(level, u, steps, settings, history):
                 np.negative(here.gradient, out=here.gradient),
                 settings.cycle_tolerance,
                 settings.max_cycles,
+                settings.estimate_exposure,
             )
             gain = dot(here.gradient, linear.x) / 2
             if level.stride == 1:
                 level.slide_along_views(linear.x, start)
-            step = without_tilt(linear.x) if settings.estimate_exposure else linear.x
+            step = linear.x
+            if settings.estimate_exposure:
+                with threads_for(step.shape):
+                    remove_plane(step)  # sliding has tilted it a little
             u = start + step
             here = _look(level, u)
             cost = _best_cost(here, level, settings)
@@ -374,8 +387,12 @@ def _descend(level, u, steps, settings, history):
         else:  # no way down: stay
             return start, _is_small(step, start, level, settings)
         level.albedo = here.albedo
+        if not knows_shadows and gain < SETTLED * abs(cost):  # those of the start were its own
+            level.see(u)
+            here, knows_shadows = level.expand(u), True
         if settings.estimate_exposure and _exposures_are_off(here, level):
-            _set_photometry(level, here.sums, settings)
+            _set_photometry(level, here.sums, settings, level.frees_albedo)
+            level.share_scale()
             here = level.expand(u)
         history.append(
             {
@@ -398,8 +415,12 @@ def _descend(level, u, steps, settings, history):
 
 def _exposures_are_off(here, level):
     """True where better exposures lower the cost by more than rounding and noise of the fit."""
-    gain = exposure_gain(here.sums, level.exposures, level.hazes)
-    return gain / 2 > EXPOSURE_GAIN * abs(here.cost)
+    gain = _exposure_gain(here, level) + level.scale_gain()
+    return gain > EXPOSURE_GAIN
+
+
+def _exposure_gain(here, level):
+    return exposure_gain(here.sums, level.exposures, level.hazes, level.frees_albedo)
 
 
 def _is_small(step, u, level, settings):
@@ -414,7 +435,7 @@ def _best_cost(here, level, settings):
     """The cost with the exposures that fit this surface best, which are closed-form."""
     if not settings.estimate_exposure:
         return here.cost
-    return here.cost - exposure_gain(here.sums, level.exposures, level.hazes) / 2
+    return here.cost - _exposure_gain(here, level) / 2
 
 
 def _look(level, u):
@@ -424,9 +445,9 @@ def _look(level, u):
     return level.expand(u)
 
 
-def _set_photometry(level, sums, settings):
+def _set_photometry(level, sums, settings, keeps_scale=False):
     level.exposures, level.hazes = best_photometry(
-        sums, level.exposures, level.hazes, settings.estimate_haze
+        sums, level.exposures, level.hazes, settings.estimate_haze, keeps_scale
     )
 
 

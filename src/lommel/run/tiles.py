@@ -43,7 +43,7 @@ ARRAYS = [
     "misfits",
     "thresholds",
     "correction",
-    "shadows",
+    "coarse",
     "position",
     "sun_position",
 ]

@@ -69,10 +69,10 @@ def finish_products(run, work, folder, record, known, progress=silent):
     record.add_skipped([Skipped(**skip) for skip in scene["skipped"]])
     record.add_not_chosen(run.footprints.not_chosen)
     with step(progress, "long waves"):
-        correction = settle_tiles(run, work, known.correction.shape)
+        correction, exposures = settle_tiles(run, work, known)
     sums = _write_products(folder, run.grid, run.plan, work, correction, progress)
     fit = SimpleNamespace(
-        exposures=known.exposures, hazes=known.hazes, misfits=_misfits(known.names, tiles)
+        exposures=exposures, hazes=known.hazes, misfits=_misfits(known.names, tiles)
     )
     views = [SimpleNamespace(name=name) for name in known.names]
     write_exposures(folder, views, record, fit)

@@ -9,10 +9,11 @@ from lommel.estimate.long_waves import Part, Remainder, settle
 from lommel.run.records import read_array, read_record
 from lommel.run.tiles_plan import blend_weights
 from lommel.run.tiles_records import part_folder
+from lommel.run.tiles_solve import frees_exposures
 from lommel.scene.grid import Window
 
 
-def settle_tiles(run, work, shape):
+def settle_tiles(run, work, known):
     """What is to be added to the blended tiles.
 
     Parameters
@@ -21,32 +22,33 @@ def settle_tiles(run, work, shape):
         All of whose tiles are done.
     work : Path
         Folder of the tiles.
-    shape : tuple of int
-        Coarse posts of the scene.
+    known : Known
 
     Returns
     -------
     correction : float32 array (coarse rows, coarse cols), m
+    exposures : array (images,), image units
     """
-    plan, parts = run.plan, []
+    plan, parts, shape = run.plan, [], known.correction.shape
     for tile in plan.tiles:
-        left = _remainder(work, tile)
-        if left is None:
+        folder = part_folder(work, tile.number)
+        names = read_record(folder).get("images")
+        if not names:  # no image sees it
             continue
+        left = _remainder(folder)
         rows, cols = left.change.shape
         place = Window(tile.outer.row // plan.stride, tile.outer.col // plan.stride, rows, cols)
         posts = Window(tile.outer.row, tile.outer.col, rows, cols)
         share = blend_weights(tile, posts, plan.shape, plan.stride)
-        parts.append(Part(left, place, _own(tile, plan, shape), share))
-    free = run.settings.solver.estimate_exposure and run.settings.exposures is None
-    return settle(parts, shape, keeps_plane=free)
+        images = [known.names.index(name) for name in names]
+        parts.append(Part(left, place, _own(tile, plan, shape), share, images))
+    free = frees_exposures(run.settings)
+    correction, change = settle(parts, shape, len(known.names), keeps_plane=free)
+    return correction, known.exposures + change
 
 
-def _remainder(work, tile):
-    """What a tile has left; None when no image sees it."""
-    folder = part_folder(work, tile.number)
-    if "images" not in read_record(folder):
-        return None
+def _remainder(folder):
+    """What a tile has left."""
     names = Remainder.__dataclass_fields__
     return Remainder(*(np.array(read_array(folder, f"left-{name}")) for name in names))
 

@@ -17,6 +17,7 @@ from lommel.errors import InputError, LommelError, UnreadableError
 from lommel.estimate.holes import fill_holes
 from lommel.estimate.measured_posts import measured_posts
 from lommel.estimate.priors import Priors
+from lommel.estimate.problem import Surroundings
 from lommel.estimate.shape_from_shading import Start, correlation, solve_surface
 from lommel.estimate.surface import Surface
 from lommel.progress import silent, step
@@ -53,8 +54,8 @@ class Known:
     stride : int
     correction : float32 array (coarse rows, coarse cols), m
         Change of the unknowns that the coarse solution found.
-    shadows : bool array (images, coarse rows - 1, coarse cols - 1)
-        Coarse cells that terrain shadows.
+    coarse : float32 array (coarse rows, coarse cols), m
+        The unknowns of the coarse solution.
     base_height : float, m
     position, sun_position : array (3,), m
         Of the first image.
@@ -70,7 +71,7 @@ class Known:
     priors: Priors
     stride: int
     correction: np.ndarray
-    shadows: np.ndarray
+    coarse: np.ndarray
     base_height: float
     position: np.ndarray
     sun_position: np.ndarray
@@ -139,7 +140,7 @@ def prepare_scene(footprints, stride, settings, progress=silent):
         replace(priors, noise=noise),
         stride,
         value.u - start,
-        np.stack(value.shadows),
+        value.u,
         base,
         np.asarray(first.position, float),
         np.asarray(first.sun_position, float),
@@ -262,6 +263,16 @@ def coarse_priors(priors, stride):
     )
 
 
+def frees_exposures(settings):
+    """Whether exposures are for the images to tell.
+
+    Parameters
+    ----------
+    settings : SfsSettings
+    """
+    return settings.solver.estimate_exposure and settings.exposures is None
+
+
 def stored_window(tile, shape):
     """Posts of a tile that are kept: its own and those that are blended with the next."""
     inner, rim = tile.inner, BLEND // 2
@@ -324,8 +335,11 @@ def solve_tile(files, grid, tile, known, settings):
             _hold(tile, grid, known.priors),
             known.misfits[seen_by],
             tile.inner.relative_to(tile.outer).slices,
-            _shadows(known, seen_by, tile.outer),
+            Surroundings(
+                known.coarse, np.array([tile.outer.row, tile.outer.col, known.stride])
+            ),
             known.brightness[seen_by],
+            frees_exposures(settings),
         ),
     )
     value = solution.value
@@ -417,18 +431,6 @@ def at_posts(coarse, stride, window):
     first = window.row - stride * low_row, window.col - stride * low_col
     refine_spline(coefficients, stride, *first, values)
     return values
-
-
-def _shadows(known, seen_by, window):
-    """Shadows of the coarse surface on the cells of a window, bool array (images, rows, cols)."""
-    stride, first = known.stride, (window.row // known.stride, window.col // known.stride)
-    cells = [size - 1 for size in window.shape]
-    count = [-(-size // stride) for size in cells]
-    out = np.empty((len(seen_by), *cells), bool)
-    for k, image in enumerate(seen_by):
-        part = known.shadows[image, first[0] : first[0] + count[0], first[1] : first[1] + count[1]]
-        out[k] = part.repeat(stride, 0).repeat(stride, 1)[: cells[0], : cells[1]]
-    return out
 
 
 def _hold(tile, grid, priors):
