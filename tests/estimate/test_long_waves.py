@@ -104,6 +104,4 @@ def test_derivatives_by_exposures_are_those_of_the_cost(albedo_error):
     np.testing.assert_allclose(left.exposure_stiffness, left.exposure_stiffness.T, rtol=1e-4)
     for k in range(2):
         expected = (gradients[k, 1] - gradients[k, 0]) / (2 * step)
-        np.testing.assert_allclose(
-            left.coupling[k], expected, atol=0.03 * np.abs(expected).max()
-        )
+        np.testing.assert_allclose(left.coupling[k], expected, atol=0.03 * np.abs(expected).max())

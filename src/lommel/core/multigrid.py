@@ -207,9 +207,7 @@ class LinearSolution:
     reduction: float
 
 
-def conjugate_gradients(
-    equations, right_hand_side, tolerance, max_iterations, keeps_plane=False
-):
+def conjugate_gradients(equations, right_hand_side, tolerance, max_iterations, keeps_plane=False):
     """Solve ``A x = right_hand_side`` from zero.
 
     Parameters

@@ -150,12 +150,14 @@ def _exposures(level, u, own, halvings):
     Where each cell's albedo is eliminated, it is so from these as well.
     """
     count = len(level.views)
-    cells = tuple(slice(s.start, min(s.stop, n)) for s, n in zip(own, level.albedo.shape, strict=True))
+    cells = tuple(
+        slice(s.start, min(s.stop, n)) for s, n in zip(own, level.albedo.shape, strict=True)
+    )
     singles = [_by_albedo(level.single_image(k), u) for k in range(count)]
     signals = [level.albedo / np.float32(exposure) for exposure in level.exposures]
     inverse = slope = total = None
     if level.frees_albedo:
-        precision = np.float32(level.albedo_error**-2.0)
+        precision = np.float32(level.stride**2 / level.albedo_error**2)
         total = sum(single[:2] for single in singles)
         inverse = 1 / (sum(single[2] for single in singles) + precision)
         slope = sum(single[3] for single in singles) + precision * (level.albedo - 1)

@@ -52,6 +52,7 @@ from lommel.estimate.shading_kernels import SUM_COUNT, SUM_RR
 from lommel.estimate.surface_and_albedo import solve_jointly
 
 COARSEST = 24  # posts along the shorter side of the coarsest level that sees the images
+NEAR = 1e-3  # expected gain of a step, relative to the cost, that a user need not wait for
 SETTLED = 0.1  # gain, relative to the cost, below which a surface moves shadows no more
 COARSE_STEPS = 4  # Gauss-Newton steps per coarse level at most; 2 on the largest of them
 ENOUGH_CELLS = 100_000  # of them tell a correlation to (1 - r^2) 0.3 %
@@ -354,7 +355,7 @@ def _coarse_to_fine(finest, settings, history, start=None):
 def _descend(level, u, steps, settings, history):
     """Gauss-Newton steps on one level, damped (Levenberg) where the cost would rise."""
     here, last_gain, damping, equations = level.expand(u), 0.0, 0.0, None
-    knows_shadows = level.stride > 1
+    knows_shadows, is_near = level.stride > 1, False
     for _ in range(steps):
         last, start = _best_cost(here, level, settings), u
         for _ in range(ATTEMPTS):
@@ -368,7 +369,9 @@ def _descend(level, u, steps, settings, history):
                 np.negative(here.gradient, out=here.gradient),
                 settings.cycle_tolerance,
                 settings.max_cycles,
-                settings.estimate_exposure,
+                # not where albedo is free: ratios of exposures then settle slowly against long
+                # waves that the kept plane shapes; a plane that is free shows them at once
+                settings.estimate_exposure and not level.frees_albedo,
             )
             gain = dot(here.gradient, linear.x) / 2
             if level.stride == 1:
@@ -376,7 +379,7 @@ def _descend(level, u, steps, settings, history):
             step = linear.x
             if settings.estimate_exposure:
                 with threads_for(step.shape):
-                    remove_plane(step)  # sliding has tilted it a little
+                    remove_plane(step)
             u = start + step
             here = _look(level, u)
             cost = _best_cost(here, level, settings)
@@ -409,8 +412,9 @@ def _descend(level, u, steps, settings, history):
         is_done = next_gain < settings.gain_tolerance * abs(cost)
         if damping == 0 and (is_done or _is_small(u - start, u, level, settings)):
             return u, True
+        is_near = damping == 0 and next_gain < NEAR * abs(cost)
         damping = less_damping(damping)
-    return u, False
+    return u, is_near
 
 
 def _exposures_are_off(here, level):

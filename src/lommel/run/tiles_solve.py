@@ -335,9 +335,7 @@ def solve_tile(files, grid, tile, known, settings):
             _hold(tile, grid, known.priors),
             known.misfits[seen_by],
             tile.inner.relative_to(tile.outer).slices,
-            Surroundings(
-                known.coarse, np.array([tile.outer.row, tile.outer.col, known.stride])
-            ),
+            Surroundings(known.coarse, np.array([tile.outer.row, tile.outer.col, known.stride])),
             known.brightness[seen_by],
             frees_exposures(settings),
         ),
