@@ -2,6 +2,10 @@
 
 import json
 import os
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from multiprocessing import active_children
 
@@ -133,6 +137,63 @@ def test_what_cannot_be_shared_is_refused(ground, tmp_path):
         prepare_albedo(*request, alternating, None, Tiling())
     with pytest.raises(LommelError, match="--tiles 0/3 first"):
         solve_albedo_share(*request, few_steps(), None, Tiling(), Share(1, 3))
+def test_job_that_always_kills_its_worker_takes_no_other_along(tmp_path):
+    """With one pool for all, whoever was at work or waited failed too, twice, and with it all."""
+    tiling = Tiling(engine="processes")
+    codes = ["import time; time.sleep(0.5)"] * 4
+    codes[1] = "import os; os.kill(os.getpid(), 9)"
+    with open_engine(tiling) as engine:
+        jobs = Parts(tmp_path, "digest", tiling, engine, 1, lambda items, *_, **__: items)
+        with pytest.raises(LommelError, match=r"1 of 4 jobs.*\n  job 1: its worker is gone: ended"):
+            jobs.each(exec, codes, "risk")
+
+
+AT_WORK = """
+import signal, sys
+from pathlib import Path
+from lommel.run.parts import Parts
+from lommel.run.tiles_engines import open_engine
+from lommel.run.tiles_plan import Tiling
+
+code = "import os, pathlib, time; pathlib.Path({!r}).write_text(str(os.getpid())); time.sleep(600)"
+if __name__ == "__main__":
+    tiling, folder = Tiling(engine="processes"), Path(sys.argv[1])
+    with open_engine(tiling) as engine:
+        jobs = Parts(folder, "digest", tiling, engine, 1, lambda items, *_, **__: items)
+        jobs.each(exec, [code.format(str(folder / "pid"))], "wait")
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_workers_end_with_the_command_however_it_ends(tmp_path, number):
+    """They would go on beside the run that comes next, or wait for ever for more to do."""
+    script, pid = tmp_path / "script.py", tmp_path / "pid"
+    script.write_text(AT_WORK)
+    command = subprocess.Popen(
+        [sys.executable, str(script), str(tmp_path)], stderr=subprocess.PIPE, text=True
+    )
+    within(60, lambda: pid.exists() and pid.read_text())
+    command.send_signal(number)
+    said = command.communicate(timeout=60)[1]
+    assert said.count("Traceback") == (number == signal.SIGINT)  # its own, not of workers
+    within(20, lambda: not is_alive(int(pid.read_text())))
+
+
+def within(seconds, happens):
+    end = time.monotonic() + seconds
+    while not happens():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def is_alive(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rsplit(")", 1)[1].split()[0] != "Z"  # its parent is gone
+    except OSError:
+        return False
+
+
     command = ["albedo", str(ground.images[0]), "--dem", str(ground.initial_dem), "--register"]
     result = CliRunner().invoke(
         app, [*command, "--output", str(tmp_path / "out"), "--tiles", "0/2"]
