@@ -130,12 +130,12 @@ def run_albedo(
     """
     settings, tiling = settings or AlbedoSettings(), tiling or Tiling()
     check_engine(tiling)
-    with output_folder(output, overwrite) as folder:
+    work = work_folder(output)
+    with output_folder(output, overwrite, work) as folder:
         record = RunRecord("albedo", asked_for(settings, grid_settings, registers))
         with record.stage("place"):
             run = place_run(files, folder, settings, grid_settings, registers, record, progress)
             plan = plan_albedo(run.placed, settings, tiling)
-            work = work_folder(output)
             kept = Kept(work, run.digest) if plan.waits_on_disk else Held()
             kept.begin(plan)
         if plan.is_shared:
@@ -144,7 +144,6 @@ def run_albedo(
                 write_products(run, plan, jobs, kept, folder, record)
         else:
             write_products(run, plan, InThreads(progress), kept, folder, record)
-    kept.remove()
     return record.results
 
 

@@ -20,11 +20,9 @@ from lommel.run.records import (
     new_part,
     read_record,
     refuse_full,
-    remove_work,
     save_part,
 )
 from lommel.run.stored_rows import StoredRows
-
 
 @dataclass(frozen=True)
 class Kept:
@@ -80,10 +78,6 @@ class Kept:
         with disk_errors(folder):
             save_part(folder, {}, {"digest": digest} | _content(found))
         return found
-
-    def remove(self):
-        """Remove all, when the products are in place."""
-        remove_work(self.folder)
 
 
 def work_folder(output):

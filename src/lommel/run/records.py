@@ -8,10 +8,8 @@ processes, also of several machines, may work in the same folder. Most callers w
 
 import hashlib
 import json
-import os
 import pickle
 import shutil
-import socket
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -19,6 +17,7 @@ import numpy as np
 
 from lommel import __version__
 from lommel.errors import LommelError
+from lommel.run.locks import me, remove
 
 RUN = "run.pickle"  # pickled, as the folder belongs to the user as compiled code does
 
@@ -31,7 +30,7 @@ def write_whole(path, content):
     path : Path
     content : bytes
     """
-    partial = path.with_name(f".{path.name}.{_me()}.partial")
+    partial = path.with_name(f".{path.name}.{me()}.partial")
     try:
         partial.write_bytes(content)
         partial.replace(path)
@@ -113,20 +112,20 @@ def new_part(folder, record):
     ------
     partial : Path
     """
-    partial = folder.with_name(f".{folder.name}.{_me()}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
+    partial = folder.with_name(f".{folder.name}.{me()}.partial")
+    remove(partial)
     partial.mkdir(parents=True)
     try:
         yield partial
         (partial / "record.json").write_text(json.dumps(record, default=_plain), encoding="utf-8")
-        shutil.rmtree(folder, ignore_errors=True)
+        remove(folder)
         try:
             partial.rename(folder)
         except OSError:
             if not is_done(folder, record["digest"]):  # by another worker, who was as quick
                 raise
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        remove(partial)
 
 
 def read_record(folder):
@@ -150,13 +149,8 @@ def read_array(folder, name):
 
 def clear_partial(folder):
     """Remove what a process that was killed has left unfinished."""
-    for partial in Path(folder).glob(".*.partial"):
-        shutil.rmtree(partial, ignore_errors=True)
-
-
-def remove_work(folder):
-    """Remove a run's tiles when its products are written."""
-    shutil.rmtree(folder, ignore_errors=True)
+    for partial in list(Path(folder).rglob(".*.partial")):
+        remove(partial)
 
 
 @contextmanager
@@ -185,11 +179,6 @@ def refuse_full(folder, size):
         raise LommelError(
             f"the disk of {folder} has {free / 1e6:.1f} MB free, {size / 1e6:.1f} MB are needed"
         )
-
-
-def _me():
-    """Name of this process among those of all machines."""
-    return f"{socket.gethostname()}.{os.getpid()}"
 
 
 def _plain(value):

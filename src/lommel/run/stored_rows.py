@@ -41,9 +41,6 @@ class Held:
             row += len(part)
         return values
 
-    def remove(self):
-        """Nothing is left."""
-
 
 class Rows:
     """Indexed by rows as an array is, some of them read at a time; for `StoredRows` and others.

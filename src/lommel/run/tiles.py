@@ -26,7 +26,6 @@ from lommel.run.records import (
     read_array,
     read_record,
     refuse_full,
-    remove_work,
     save_part,
 )
 from lommel.run.tiles_engines import check_engine, solve_all
@@ -89,7 +88,6 @@ def run_tiles(
     with record.stage("write"), disk_errors(folder):
         finish_products(run, work, folder, record, load_known(work), progress)
     record.write(folder)
-    remove_work(work)
     return record.results
 
 
