@@ -106,9 +106,16 @@ def test_job_that_fails_is_told_and_the_others_are_kept(tmp_path):
         with pytest.raises(LommelError, match=r"1 of 3 jobs of the step 'roots'.*\n.*job 1: Value"):
             jobs.each(int, ["1", "two", "3"], "roots")
         assert list((tmp_path / "roots").glob("0*")) != []
-        (job_folder(tmp_path / "roots", 0) / parts.RESULTS).write_bytes(b"")
-        with pytest.raises(LommelError, match="Remove that folder"):
-            list(jobs.each(int, ["1", "2", "3"], "roots"))
+
+
+@pytest.mark.parametrize("damage", ["cut off", "zeroed"])
+def test_results_that_are_damaged_are_made_anew(tmp_path, damage):
+    with open_engine(Tiling()) as engine:
+        jobs = Parts(tmp_path, "digest", Tiling(), engine, 1, lambda items, *_, **__: items)
+        assert list(jobs.each(abs, [-1, -2], "sizes")) == [1, 2]
+        results = job_folder(tmp_path / "sizes", 0) / parts.RESULTS
+        results.write_bytes(b"" if damage == "cut off" else bytes(results.stat().st_size))
+        assert list(jobs.each(abs, [-1, -2], "sizes")) == [1, 2]
 
 
 DIES_ONCE = """
@@ -130,13 +137,6 @@ def test_worker_that_dies_takes_no_result_along(tmp_path):
     assert not active_children()
 
 
-def test_what_cannot_be_shared_is_refused(ground, tmp_path):
-    request = files_of(ground), tmp_path / "out"
-    alternating = replace(few_steps(), solver="alternating")
-    with pytest.raises(InputError, match="alternating goes not with --tiles"):
-        prepare_albedo(*request, alternating, None, Tiling())
-    with pytest.raises(LommelError, match="--tiles 0/3 first"):
-        solve_albedo_share(*request, few_steps(), None, Tiling(), Share(1, 3))
 def test_job_that_always_kills_its_worker_takes_no_other_along(tmp_path):
     """With one pool for all, whoever was at work or waited failed too, twice, and with it all."""
     tiling = Tiling(engine="processes")
@@ -194,6 +194,13 @@ def is_alive(pid):
         return False
 
 
+def test_what_cannot_be_shared_is_refused(ground, tmp_path):
+    request = files_of(ground), tmp_path / "out"
+    alternating = replace(few_steps(), solver="alternating")
+    with pytest.raises(InputError, match="alternating goes not with --tiles"):
+        prepare_albedo(*request, alternating, None, Tiling())
+    with pytest.raises(LommelError, match="--tiles 0/3 first"):
+        solve_albedo_share(*request, few_steps(), None, Tiling(), Share(1, 3))
     command = ["albedo", str(ground.images[0]), "--dem", str(ground.initial_dem), "--register"]
     result = CliRunner().invoke(
         app, [*command, "--output", str(tmp_path / "out"), "--tiles", "0/2"]

@@ -7,9 +7,10 @@ import subprocess
 import pytest
 
 from lommel.errors import LommelError
-from lommel.run.records import disk_errors, is_done, read_record
+from lommel.run.records import RUN, disk_errors, is_done, read_record
 from lommel.run.shape_from_shading import run_shape_from_shading
 from lommel.run.tiles import solve_part
+from lommel.run.tiles_array import merge_tiles
 from lommel.run.tiles_plan import Tiling, work_folder
 from lommel.run.tiles_records import load_run, part_folder
 
@@ -74,3 +75,30 @@ def test_a_tile_fails_when_its_image_breaks_and_is_not_solved_without_it(
     assert solve_part(work, 1) is None
     assert is_done(part_folder(work, 1), load_run(work).digest)
     assert read_record(part_folder(work, 1))["images"] == ["img1.tif", "img2.tif"]
+
+
+def test_parts_that_a_crash_has_damaged_are_made_anew(half_done, tile_scene, tiled):
+    """Files were cut off, zeroed or gone: a traceback, or products made of zeros."""
+    work = work_folder(half_done)
+    damage(part_folder(work, 0) / "dem.npy", bytes)
+    damage(part_folder(work, 2) / "albedo.npy", lambda size: b"")
+    damage(part_folder(work, 4) / "record.json", bytes)
+    (part_folder(work, 6) / "residual.npy").unlink()
+    damage(work / "scene" / "correction.npy", bytes)
+    damage(work / RUN, lambda size: bytes(range(256)))
+    damage(work / "plan.json", bytes)
+    run_shape_from_shading(files_of(tile_scene), half_done, tiling=TILING)
+    assert fingerprints(half_done) == fingerprints(tiled)
+
+
+def damage(path, content):
+    path.write_bytes(content(path.stat().st_size))
+
+
+def test_merge_tells_which_damaged_tiles_are_to_be_solved_again(half_done):
+    damage(part_folder(work_folder(half_done), 4) / "dem.npy", bytes)
+    with pytest.raises(LommelError, match="5 of 9 tiles are not solved: 1, 3, 4, 5, 7"):
+        merge_tiles(half_done)
+    damage(work_folder(half_done) / "scene" / "noise.npy", bytes)
+    with pytest.raises(LommelError, match="is not prepared. Run --tiles 0/N again"):
+        merge_tiles(half_done)

@@ -15,7 +15,16 @@ from numba import get_num_threads
 from lommel import __version__
 from lommel.errors import LommelError
 from lommel.jobs import in_order
-from lommel.run.records import digest_of, disk_errors, is_done, load_pickled, new_part, write_whole
+from lommel.run.locks import remove
+from lommel.run.records import (
+    digest_of,
+    disk_errors,
+    is_done,
+    is_sound,
+    load_pickled,
+    new_part,
+    write_whole,
+)
 from lommel.run.shares import Share
 from lommel.run.tiles_engines import solve_all
 from lommel.run.tiles_plan import Tiling
@@ -87,7 +96,8 @@ class Parts:
         folder = self.folder / re.sub(r"\W+", "-", name)
         digest = digest_of([self.digest, name])
         jobs = [items[first : first + together] for first in range(0, len(items), together)]
-        done = [is_done(job_folder(folder, number), digest) for number in range(len(jobs))]
+        is_kept = is_sound if self.share is None else is_done  # shares read too much otherwise
+        done = [is_kept(job_folder(folder, number), digest) for number in range(len(jobs))]
         left = [number for number in self._in_turn(len(jobs)) if not done[number]]
         if left and self.is_complete:
             raise LommelError(
@@ -161,8 +171,9 @@ def _results(folder, count):
     for number in range(count):
         try:
             yield from pickle.loads((job_folder(folder, number) / RESULTS).read_bytes())
-        except (OSError, pickle.PickleError, EOFError, AttributeError, ImportError) as error:
+        except Exception as error:  # bytes that are none of a pickle raise whatever they like
+            remove(job_folder(folder, number))
             raise LommelError(
-                f"{job_folder(folder, number)} cannot be read ({error}). Remove that folder; the "
-                "same command makes it anew."
+                f"{job_folder(folder, number)} was damaged ({error}) and is removed. The same "
+                "command makes it anew."
             ) from error

@@ -1,16 +1,18 @@
 """Parts of a run on the disk, each whole or not at all, so that a run can be broken off.
 
 A part is a folder with arrays or other files and ``record.json``, which takes its name when it is
-whole. It counts as done when its record carries the digest of what it was made from. Several
-processes, also of several machines, may work in the same folder. Most callers want `save_part` and
-`is_done`.
+whole. It counts as done when its record carries the digest of what it was made from, and its files
+are those the record lists: a machine that loses its power may keep the name of a file and lose what
+was in it. Several processes, also of several machines, may work in the same folder. Most callers
+want `save_part` and `is_done`.
 """
 
 import hashlib
 import json
 import pickle
 import shutil
-from contextlib import contextmanager
+import zlib
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,7 @@ from lommel.errors import LommelError
 from lommel.run.locks import me, remove
 
 RUN = "run.pickle"  # pickled, as the folder belongs to the user as compiled code does
+AT_ONCE = 2**20  # bytes of a file that are read at a time
 
 
 def write_whole(path, content):
@@ -62,7 +65,9 @@ def load_pickled(path):
             f"{path} cannot be read ({error.strerror}). All workers must see the folder of the "
             "output, on a shared disk, and the run must have been prepared."
         ) from error
-    except (pickle.PickleError, EOFError, AttributeError, ImportError, IndexError) as error:
+    except LommelError:
+        raise
+    except Exception as error:  # bytes that are none of a pickle raise whatever they like
         raise LommelError(f"{path} is damaged ({error}). Prepare the run anew.") from error
     return content
 
@@ -117,7 +122,11 @@ def new_part(folder, record):
     partial.mkdir(parents=True)
     try:
         yield partial
-        (partial / "record.json").write_text(json.dumps(record, default=_plain), encoding="utf-8")
+        files = {path.name: _seal(path) for path in sorted(partial.iterdir())}
+        text = json.dumps(record | {"files": files}, default=_plain)
+        (partial / "record.json").write_text(text, encoding="utf-8")
+        if is_done(folder, record["digest"]):  # by another worker, and others may be reading it
+            return
         remove(folder)
         try:
             partial.rename(folder)
@@ -138,8 +147,53 @@ def read_record(folder):
 
 
 def is_done(folder, digest):
-    """True when the part exists and was made from the same settings and inputs."""
-    return read_record(folder).get("digest") == digest
+    """True when the part exists, was made from the same settings and inputs, and lacks no byte."""
+    record = read_record(folder)
+    sizes = {name: size for name, (size, _) in record.get("files", {}).items()}
+    return record.get("digest") == digest and all(
+        _size(Path(folder) / name) == size for name, size in sizes.items()
+    )
+
+
+def is_sound(folder, digest):
+    """The same after every byte was read; a part with other bytes than it had is removed.
+
+    For parts that an earlier run has left: workers, who ask `is_done`, then make them anew.
+
+    Parameters
+    ----------
+    folder : Path
+    digest : str
+
+    Returns
+    -------
+    is_sound : bool
+    """
+    if not is_done(folder, digest):
+        return False
+    seals = read_record(folder).get("files", {})
+    with suppress(OSError):
+        if all(_seal(Path(folder) / name) == tuple(seal) for name, seal in seals.items()):
+            return True
+    remove(folder)
+    return False
+
+
+def _size(path):
+    try:
+        return path.stat().st_size
+    except OSError:
+        return None
+
+
+def _seal(path):
+    """Size and checksum of a file: they tell what a crash or a disk has changed."""
+    size = checksum = 0
+    with open(path, "rb") as file:
+        while content := file.read(AT_ONCE):
+            size += len(content)
+            checksum = zlib.crc32(content, checksum)
+    return size, checksum
 
 
 def read_array(folder, name):

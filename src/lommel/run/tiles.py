@@ -23,6 +23,7 @@ from lommel.run.records import (
     digest_of,
     disk_errors,
     is_done,
+    is_sound,
     read_array,
     read_record,
     refuse_full,
@@ -138,7 +139,7 @@ def prepare(run, work, progress=silent):
     with disk_errors(work):
         work.mkdir(parents=True, exist_ok=True)
         save_run(work, run)
-    if is_done(work / "scene", run.digest):
+    if is_sound(work / "scene", run.digest):
         return
     known, solution, skipped = prepare_scene(
         run.footprints, run.plan.stride, run.settings, progress
@@ -158,7 +159,7 @@ def solve_tiles(work, tiles, tiling, progress=silent):
     progress : callable
     """
     run, numbers = load_run(work), [tile.number for tile in tiles]
-    left = [n for n in numbers if not is_done(part_folder(work, n), run.digest)]
+    left = [n for n in numbers if not is_sound(part_folder(work, n), run.digest)]
     failed = solve_all(solve_part, work, left, tiling, progress)
     if failed:
         raise LommelError(

@@ -12,7 +12,7 @@ from lommel.progress import silent, step
 from lommel.run.inputs import GridSettings
 from lommel.run.locks import only_run
 from lommel.run.products import RunRecord, output_folder
-from lommel.run.records import RUN, disk_errors, is_done
+from lommel.run.records import RUN, disk_errors, is_done, is_sound
 from lommel.run.selection import survey_images
 from lommel.run.shares import prepare_again, refuse_changes, refuse_registration
 from lommel.run.tiles import describe_run, load_known, prepare, solve_tiles
@@ -112,11 +112,11 @@ def merge_tiles(output, overwrite=False, progress=silent):
         )
     run = load_run(work)
     numbers = [tile.number for tile in run.plan.tiles]
-    if not is_done(work / "scene", run.digest):
+    if not is_sound(work / "scene", run.digest):
         raise LommelError(
             f"The scene in {work} is not prepared. Run --tiles 0/N again, then all shares."
         )
-    missing = [n for n in numbers if not is_done(part_folder(work, n), run.digest)]
+    missing = [n for n in numbers if not is_sound(part_folder(work, n), run.digest)]
     if missing:
         shown = ", ".join(map(str, missing[:10])) + (", ..." if len(missing) > 10 else "")
         raise LommelError(
