@@ -160,7 +160,32 @@ def test_what_a_crash_has_damaged_is_made_anew(ground, tmp_path, unbroken, is_ar
     assert [path.name for path in tmp_path.glob(".out*")] == []
 
 
-def test_image_damaged_while_a_run_is_at_work_is_told(ground, tmp_path):
+@pytest.mark.parametrize("step", ["terrain", "images"])
+@pytest.mark.parametrize("damage", ["gone", "cut off", "replaced"])
+def test_input_that_changes_while_it_is_read_ends_the_run(ground, tmp_path, unbroken, step, damage):
+    """Nothing that was read of it is kept, and no map is made without it."""
+    output, path = tmp_path / "out", ground.initial_dem if step == "terrain" else ground.images[1]
+    before = path.read_bytes()
+
+    def progress(items, name, total=None, at_once=1):
+        if name == step:
+            path.unlink()
+        if name == step and damage != "gone":
+            path.write_bytes(before[:4000] if damage == "cut off" else before)
+        return items
+
+    try:
+        with pytest.raises(LommelError, match=re.escape(path.name)):
+            run_albedo(files_of(ground), output, few_steps(), progress=progress)
+    finally:
+        path.write_bytes(before)
+    kept = {folder.name for folder in work_folder(output).iterdir()}
+    assert not kept & {"photometry", "heights-00000" if step == "terrain" else "image-00001"}
+    run_albedo(files_of(ground), output, few_steps())
+    assert content(output) == unbroken
+
+
+def test_kept_rows_damaged_while_a_run_is_at_work_are_told(ground, tmp_path):
     output = tmp_path / "out"
 
     def progress(items, name, total=None, at_once=1):

@@ -59,15 +59,16 @@ def test_what_the_disk_refuses_is_told_in_words(tmp_path):
         raise OSError(28, "too full")
 
 
-@pytest.mark.parametrize("damage", ["gone", "truncated"])
+@pytest.mark.parametrize("damage", ["gone", "truncated", "replaced"])
 def test_a_tile_fails_when_its_image_breaks_and_is_not_solved_without_it(
     half_done, tile_scene, damage
 ):
     image, work = tile_scene / "img2.tif", work_folder(half_done)
     aside = image.rename(tile_scene / "aside")
     try:
-        if damage == "truncated":
-            image.write_bytes(aside.read_bytes()[:4000])
+        if damage != "gone":
+            content = aside.read_bytes()
+            image.write_bytes(content[:4000] if damage == "truncated" else content)
         assert str(image) in solve_part(work, 1)
         assert not part_folder(work, 1).exists()
     finally:

@@ -26,7 +26,7 @@ from lommel.run.inputs import GridSettings, SceneFiles, Skipped
 from lommel.run.mixed_scene import PlacedScene, place_scene, raw_cameras, read_placed
 from lommel.run.parts import Parts
 from lommel.run.products import RunRecord, output_folder
-from lommel.run.records import digest_of
+from lommel.run.records import digest_of, stamps
 from lommel.run.register import settle_cameras
 from lommel.run.stored_rows import Held
 from lommel.run.tiles_engines import check_engine, open_engine
@@ -72,6 +72,8 @@ class AlbedoRun:
         The settings as ``run.json`` shows them.
     inputs : list of dict
         Path, bytes and digest of each input file.
+    stamps : dict of str to (int, int)
+        Size and time of change of each, before its digest was taken.
     lost : list of Skipped
         Images that could not be registered.
     remark : str
@@ -84,6 +86,7 @@ class AlbedoRun:
     settings: AlbedoSettings
     asked: dict
     inputs: list
+    stamps: dict
     lost: list
     remark: str
     version: str = __version__
@@ -174,10 +177,11 @@ def place_run(files, folder, settings, grid_settings, registers, record, progres
     """
     tables = (files.sun_positions, files.spacecraft_positions)
     inputs = [*files.images, *files.dems, *files.cameras, *filter(None, tables)]
+    before = stamps(inputs)
     record.add_inputs(inputs, progress)
     settled, *lost = settle_cameras(files, folder, registers, raw_cameras(files), progress)
     placed = place_scene(settled, grid_settings, progress=progress)
-    return AlbedoRun(placed, settings, dict(record.settings), list(record.inputs), *lost)
+    return AlbedoRun(placed, settings, dict(record.settings), list(record.inputs), before, *lost)
 
 
 def photometry_of(run, plan, jobs, kept):
@@ -196,7 +200,7 @@ def photometry_of(run, plan, jobs, kept):
     fit : function ()
         Gives `Problem` and `Photometry`.
     """
-    scene = read_placed(run.placed, jobs, kept.rows)
+    scene = read_placed(run.placed, jobs, kept.rows, run.stamps)
     names = [observation.name for observation in scene.observations]
     remember = None if kept.photometry is None else partial(kept.photometry, names=names)
     given = scene.observations, scene.grid, scene.heights, run.settings

@@ -9,6 +9,7 @@ want `save_part` and `is_done`.
 
 import hashlib
 import json
+import os
 import pickle
 import shutil
 import zlib
@@ -199,6 +200,43 @@ def _seal(path):
 def read_array(folder, name):
     """An array of a part, read from disk as it is used."""
     return np.load(Path(folder) / f"{name}.npy", mmap_mode="r", allow_pickle=False)
+
+
+def stamps(paths):
+    """Size and time of change of files, by their absolute paths; None for one that is not there.
+
+    Parameters
+    ----------
+    paths : iterable of path
+    """
+    return {os.path.abspath(path): _stamp(path) for path in paths}
+
+
+def _stamp(path):
+    try:
+        state = os.stat(path)
+    except OSError:
+        return None
+    return state.st_size, state.st_mtime_ns
+
+
+def refuse_changed(known, paths):
+    """`LommelError` for files that are not as they were when the run began.
+
+    What was read of them may be of one state or of the other, and the digests are of the first.
+
+    Parameters
+    ----------
+    known : dict
+        From `stamps`; a file that it does not name may change.
+    paths : iterable of path
+    """
+    for path, stamp in stamps(paths).items():
+        if stamp != known.get(path, stamp):
+            raise LommelError(
+                f"{path} has changed while the run was at work. When it is as it shall stay, give "
+                "the same command again."
+            )
 
 
 def clear_partial(folder):

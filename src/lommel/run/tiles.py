@@ -26,8 +26,10 @@ from lommel.run.records import (
     is_sound,
     read_array,
     read_record,
+    refuse_changed,
     refuse_full,
     save_part,
+    stamps,
 )
 from lommel.run.tiles_engines import check_engine, solve_all
 from lommel.run.tiles_plan import Tiling, plan_tiles, work_folder
@@ -107,6 +109,7 @@ def describe_run(files, footprints, lost, output, settings, grid_settings, tilin
     record = RunRecord("sfs", asdict(settings) | {"grid": asdict(grid_settings or GridSettings())})
     tables = (files.sun_positions, files.spacecraft_positions, settings.albedo, settings.exposures)
     inputs = [*files.images, *files.dems, *files.cameras, *filter(None, tables)]
+    before = stamps(inputs)
     record.add_inputs(inputs, progress, footprints.unused(files))
     plan = plan_tiles(footprints, tiling, output)
     return TiledRun(
@@ -119,6 +122,7 @@ def describe_run(files, footprints, lost, output, settings, grid_settings, tilin
         ),
         record.settings,
         record.inputs,
+        before,
         [*lost, *footprints.skipped],
         digest_of(
             [record.settings, record.inputs, asdict(plan) | {"memory": None}, footprints.choice]
@@ -144,6 +148,7 @@ def prepare(run, work, progress=silent):
     known, solution, skipped = prepare_scene(
         run.footprints, run.plan.stride, run.settings, progress
     )
+    _refuse_changed(run, run.footprints.used)
     with disk_errors(work):
         _save_known(work / "scene", known, solution, [*run.lost, *skipped], run.digest)
 
@@ -189,6 +194,7 @@ def solve_part(work, number):
         refuse_full(work, size_on_disk(tile, run.grid.shape))
         files = run.footprints.within(tile.outer)
         products, record = solve_tile(files, run.grid, tile, load_known(work), run.settings)
+        _refuse_changed(run, files)
         record |= {
             "digest": run.digest,
             "seconds": round(time.perf_counter() - start, 3),
@@ -199,6 +205,10 @@ def solve_part(work, number):
     except Exception as error:  # whatever it is: the other tiles go on
         return str(error) if isinstance(error, LommelError) else f"{type(error).__name__}: {error}"
     return None
+
+
+def _refuse_changed(run, files):
+    refuse_changed(run.stamps, [*files.images, *files.dems, *filter(None, files.cameras)])
 
 
 def load_known(work):
