@@ -18,6 +18,7 @@ from lommel.run.albedo_array import merge_albedo, prepare_albedo, solve_albedo_s
 from lommel.run.albedo_plan import plan_albedo
 from lommel.run.albedo_records import work_folder
 from lommel.run.mixed_scene import Place, PlacedScene, place_scene
+from lommel.run.records import save_part
 from lommel.run.shares import Share
 from lommel.run.tiles_plan import Tiling
 from lommel.scene.grid import Window, grid_from_bounds, read_crs
@@ -183,6 +184,20 @@ def test_input_that_changes_while_it_is_read_ends_the_run(ground, tmp_path, unbr
     assert not kept & {"photometry", "heights-00000" if step == "terrain" else "image-00001"}
     run_albedo(files_of(ground), output, few_steps())
     assert content(output) == unbroken
+
+
+def test_image_that_a_worker_of_an_earlier_run_replaces_is_noticed(ground, tmp_path):
+    """A Dask worker goes on when its run is killed, and leaves an image of another grid."""
+    output = tmp_path / "out"
+
+    def progress(items, name, total=None, at_once=1):
+        yield from items
+        if name == "maps, block":
+            save_part(work_folder(output) / "image-00001", {}, {"digest": "of the earlier run"})
+
+    with pytest.raises(LommelError, match="image-00001 was replaced meanwhile, by a worker"):
+        run_albedo(files_of(ground), output, few_steps(), progress=progress)
+    assert not output.exists()
 
 
 def test_kept_rows_damaged_while_a_run_is_at_work_are_told(ground, tmp_path):

@@ -4,10 +4,12 @@ import os
 import shutil
 import subprocess
 
+import numpy as np
 import pytest
 
 from lommel.errors import LommelError
-from lommel.run.records import RUN, disk_errors, is_done, read_record
+from lommel.run import tiles
+from lommel.run.records import RUN, disk_errors, is_done, read_record, save_part
 from lommel.run.shape_from_shading import run_shape_from_shading
 from lommel.run.tiles import solve_part
 from lommel.run.tiles_array import merge_tiles
@@ -103,3 +105,19 @@ def test_merge_tells_which_damaged_tiles_are_to_be_solved_again(half_done):
     damage(work_folder(half_done) / "scene" / "noise.npy", bytes)
     with pytest.raises(LommelError, match="is not prepared. Run --tiles 0/N again"):
         merge_tiles(half_done)
+
+
+def test_tile_that_a_worker_of_an_earlier_run_replaces_is_noticed(
+    half_done, tile_scene, monkeypatch
+):
+    """A Dask worker goes on when its run is killed; its tile, of other settings, was blended in."""
+    finish = tiles.finish_products
+
+    def replaced_after(run, work, *rest):
+        finish(run, work, *rest)
+        save_part(part_folder(work, 3), {"dem": np.zeros(3)}, {"digest": "of the earlier run"})
+
+    monkeypatch.setattr(tiles, "finish_products", replaced_after)
+    with pytest.raises(LommelError, match="tile-00003 was replaced meanwhile, by a worker"):
+        run_shape_from_shading(files_of(tile_scene), half_done, tiling=TILING)
+    assert not half_done.exists()

@@ -26,9 +26,9 @@ from lommel.run.inputs import GridSettings, SceneFiles, Skipped
 from lommel.run.mixed_scene import PlacedScene, place_scene, raw_cameras, read_placed
 from lommel.run.parts import Parts
 from lommel.run.products import RunRecord, output_folder
-from lommel.run.records import digest_of, stamps
+from lommel.run.records import digest_of, refuse_foreign, stamps
 from lommel.run.register import settle_cameras
-from lommel.run.stored_rows import Held
+from lommel.run.stored_rows import Held, StoredRows
 from lommel.run.tiles_engines import check_engine, open_engine
 from lommel.run.tiles_plan import Tiling
 
@@ -223,6 +223,7 @@ def write_products(run, plan, jobs, kept, folder, record):
     with record.stage("solve"), plan.limits(), Products(folder, scene.grid) as products:
         problem, found = fit()
         result = collect(problem, found, make_maps(problem, found), products.take)
+    refuse_foreign(stored_in(scene), run.digest)
     with record.stage("write"):
         names = [observation.name for observation in scene.observations]
         reasons = zip(names, result.reasons, strict=True)
@@ -234,6 +235,12 @@ def write_products(run, plan, jobs, kept, folder, record):
     record.history = result.history
     record.outcome = {"name": result.outcome, "sentence": result.advice + run.remark}
     record.write(folder)
+
+
+def stored_in(scene):
+    """Folders of what waits on the disk of a scene."""
+    rows = [*getattr(scene.heights, "bands", ()), *(one.measured for one in scene.observations)]
+    return [one.path.parent for one in rows if isinstance(one, StoredRows)]
 
 
 def _write_exposures(path, names, result, skipped):

@@ -23,6 +23,7 @@ from lommel.run.records import (
     is_sound,
     load_pickled,
     new_part,
+    refuse_foreign,
     write_whole,
 )
 from lommel.run.shares import Share
@@ -120,7 +121,7 @@ class Parts:
                     + "\n".join(f"  job {number}: {why}" for number, why in failed.items())
                     + f"\nThe others wait in {folder}: the same command goes on from there."
                 )
-        return _results(folder, len(jobs))
+        return _results(folder, len(jobs), digest)
 
     def _in_turn(self, count):
         if self.share is None:
@@ -167,13 +168,15 @@ def do_job(folder, number):
     return None
 
 
-def _results(folder, count):
+def _results(folder, count, digest):
     for number in range(count):
         try:
-            yield from pickle.loads((job_folder(folder, number) / RESULTS).read_bytes())
+            results = pickle.loads((job_folder(folder, number) / RESULTS).read_bytes())
         except Exception as error:  # bytes that are none of a pickle raise whatever they like
             remove(job_folder(folder, number))
             raise LommelError(
                 f"{job_folder(folder, number)} was damaged ({error}) and is removed. The same "
                 "command makes it anew."
             ) from error
+        refuse_foreign([job_folder(folder, number)], digest)
+        yield from results

@@ -180,6 +180,25 @@ def is_sound(folder, digest):
     return False
 
 
+def refuse_foreign(folders, digest):
+    """`LommelError` where a part that was used is of another run by now.
+
+    A worker of a cluster goes on with the part it has when its run is killed, and may write it
+    after a run with other settings has made its own.
+
+    Parameters
+    ----------
+    folders : iterable of Path
+    digest : str
+    """
+    for folder in folders:
+        if not is_done(folder, digest):
+            raise LommelError(
+                f"{folder} was replaced meanwhile, by a worker that an earlier run with other "
+                "settings or inputs has left at work. Give the same command again."
+            )
+
+
 def _size(path):
     try:
         return path.stat().st_size

@@ -27,6 +27,7 @@ from lommel.run.records import (
     read_array,
     read_record,
     refuse_changed,
+    refuse_foreign,
     refuse_full,
     save_part,
     stamps,
@@ -88,10 +89,28 @@ def run_tiles(
         prepare(run, work, progress)
     with record.stage("tiles"):
         solve_tiles(work, run.plan.tiles, tiling, progress)
+    write_products(run, work, folder, record, progress)
+    return record.results
+
+
+def write_products(run, work, folder, record, progress=silent):
+    """Blend the tiles into products, and write the record of the run.
+
+    Parameters
+    ----------
+    run : TiledRun
+        All of whose tiles are done.
+    work : Path
+    folder : Path
+        That the products are written to.
+    record : RunRecord
+    progress : callable
+    """
     with record.stage("write"), disk_errors(folder):
         finish_products(run, work, folder, record, load_known(work), progress)
+    parts = [part_folder(work, tile.number) for tile in run.plan.tiles]
+    refuse_foreign([work / "scene", *parts], run.digest)
     record.write(folder)
-    return record.results
 
 
 def describe_run(files, footprints, lost, output, settings, grid_settings, tiling, progress=silent):

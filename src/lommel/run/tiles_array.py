@@ -12,13 +12,12 @@ from lommel.progress import silent, step
 from lommel.run.inputs import GridSettings
 from lommel.run.locks import only_run
 from lommel.run.products import RunRecord, output_folder
-from lommel.run.records import RUN, disk_errors, is_done, is_sound
+from lommel.run.records import RUN, is_done, is_sound
 from lommel.run.selection import survey_images
 from lommel.run.shares import prepare_again, refuse_changes, refuse_registration
-from lommel.run.tiles import describe_run, load_known, prepare, solve_tiles
+from lommel.run.tiles import describe_run, prepare, solve_tiles, write_products
 from lommel.run.tiles_engines import check_engine
 from lommel.run.tiles_plan import work_folder
-from lommel.run.tiles_products import finish_products
 from lommel.run.tiles_records import load_run, part_folder
 
 
@@ -125,7 +124,5 @@ def merge_tiles(output, overwrite=False, progress=silent):
         )
     record = RunRecord("sfs", dict(run.asked), list(run.inputs))
     with output_folder(output, overwrite, work) as folder:
-        with record.stage("write"), disk_errors(folder):
-            finish_products(run, work, folder, record, load_known(work), progress)
-        record.write(folder)
+        write_products(run, work, folder, record, progress)
     return record.results
