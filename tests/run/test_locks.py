@@ -2,6 +2,7 @@
 
 import errno
 import fcntl
+import os
 import signal
 import subprocess
 import sys
@@ -113,6 +114,17 @@ def test_what_a_run_goes_on_with_stays_until_the_products_have_their_name(tmp_pa
     remove(tmp_path / "out")
     write(tmp_path / "out", work=work)
     assert names(tmp_path) == ["out"]
+
+
+def test_what_a_run_goes_on_with_stays_until_the_disk_has_the_products(tmp_path, monkeypatch):
+    def refuse(_):
+        raise OSError(errno.EIO, "Input/output error")
+
+    (tmp_path / ".out.tiles").mkdir()
+    monkeypatch.setattr(os, "fsync", refuse)
+    with pytest.raises(LommelError, match="may not have reached its disk: Input/output error"):
+        write(tmp_path / "out", work=tmp_path / ".out.tiles")
+    assert names(tmp_path) == [".out.tiles", "out"]
 
 
 def test_what_is_removed_loses_its_name_first(tmp_path, monkeypatch):

@@ -67,8 +67,25 @@ def output_folder(path, overwrite=False, work=None):
             remove(staging)
             raise
         _take_name(staging, path, overwrite)
-        if work is not None:
+        if work is not None and work.exists():
+            _flush(path)
             remove(work)
+
+
+def _flush(folder):
+    """Have the disk take a folder in, before what it was made from goes."""
+    try:
+        for path in (*folder.rglob("*"), folder, folder.parent):
+            descriptor = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+    except OSError as error:
+        raise LommelError(
+            f"{path} may not have reached its disk: {error.strerror}. What it was made from is "
+            "kept: when the disk is well, the same command with --overwrite writes it again."
+        ) from error
 
 
 def _refuse_filled(path, overwrite):
