@@ -297,47 +297,63 @@ def scheduler_killed(command, folder, table):
     """Lose the scheduler, then go on with a new one."""
     output, log = folder / "out", folder / "log"
     clear(output)
-    with cluster(folder) as (address, parts):
+    with cluster(folder) as (address, processes):
         running = Running(command.words(output, "cluster", address), log)
-        running.wait(0.6 * command.seconds + 4)
-        for pid in session(parts[0].pid):
+        parts = f".{output.name}.*/[ti]*-0000*"  # tiles or images: workers are at work
+        while not any(folder.glob(parts)) and running.wait(0.05) is None:
+            pass
+        for pid in session(processes[0].pid):
             os.kill(pid, signal.SIGKILL)
-        status = running.wait(120)
-        told = status == 1 and "scheduler was lost" in running.said
+        status, said = running.wait(120), " ".join(running.said.split())
+        told = status in (1, 2) and "scheduler" in said and "Traceback" not in said
     with cluster(folder) as (address, _):
         what, is_good = settle(command, output, command.words(output, "cluster", address), log)
-    end = "told" if told else f"status {status}: {' '.join(running.said.split())[:200]}"
-    table.add(f"`{command.name}`: scheduler killed", f"{end}; then {what}", told and is_good)
+    table.add(f"`{command.name}`: scheduler killed", f"{said[:200]}; then {what}", told and is_good)
     clear(output)
 
 
-def full_disk(command, engine, folder, table, times):
-    """Let somebody fill the disk after a share of the run, or before it; then make room."""
+def full_disk(command, engine, folder, table):
+    """Let somebody fill the disk before the run, on its way, or while it writes its products."""
     output, log, disk = folder / "disk" / "out", folder / "log", folder / "disk"
     disk.mkdir(exist_ok=True)
     words = command.words(output, engine)
-    for share in times:
+    for moment in (0.0, 0.25, 0.5, *("products",) * 4):
         mount = ["mount", "-t", "tmpfs", "-o", "size=200m", "tmpfs", str(disk)]
         subprocess.run(mount, check=True)
         try:
             running = Running(words, log)
-            running.wait(share * command.seconds)
-            room = shutil.disk_usage(disk).free
-            with suppress(OSError), open(disk / "ballast", "wb", buffering=0) as file:
-                while room > 0:
-                    room -= file.write(bytes(4096))
+            if moment == "products":
+                while not any(disk.glob(".out.*.partial/*")) and running.wait(0.005) is None:
+                    pass
+                room = random.choice((0, 50_000, 400_000, 1_000_000))
+            else:
+                running.wait(moment * command.seconds)
+                room = 0
+            room = fill(disk, room)
             status = running.wait()
             said = " ".join(running.said.split())
             told = status in (1, 2) and "Traceback" not in said and "free" in said
             (disk / "ballast").unlink()
+            if status == 0:
+                told = digests(output) == command.products
+                said = "had room enough" if told else "OTHER BYTES"
             what, is_good = settle(command, output, words, log)
         finally:
             subprocess.run(["umount", str(disk)], check=True)
+        when = f"with its {moment}" if moment == "products" else f"after {moment:.0%}"
         table.add(
-            f"`{command.name}`, {engine}: disk full after {share:.0%}",
-            f"{'had room enough' if status == 0 else said[:240]}; emptied: {what}",
-            (told or status == 0) and is_good,
+            f"`{command.name}`, {engine}: disk full {when}, {room / 1e6:.2f} MB left",
+            f"{said[:240]}; emptied: {what}",
+            told and is_good,
         )
+
+
+def fill(disk, room):
+    """Leave only so many bytes on a disk."""
+    with suppress(OSError), open(disk / "ballast", "wb", buffering=0) as file:
+        while shutil.disk_usage(disk).free > room:
+            file.write(bytes(min(2**16, max(shutil.disk_usage(disk).free - room, 4096))))
+    return shutil.disk_usage(disk).free
 
 
 def damaged(command, engine, folder, table, changes=12):
@@ -504,9 +520,8 @@ def main():
         if "scheduler" in given.only:
             scheduler_killed(command, folder, table)
         if "disk" in given.only and os.geteuid() == 0:
-            times = [k / 10 for k in range(11)]
-            full_disk(command, "serial", folder, table, times)
-            full_disk(command, "processes", folder, table, times)
+            full_disk(command, "serial", folder, table)
+            full_disk(command, "processes", folder, table)
         if "shares" in given.only:
             shares_killed(command, folder, table)
     sys.exit(table.is_bad)
