@@ -82,7 +82,8 @@ class Command:
             return words
         kind = "array" if options else engine
         if kind not in self.memory:
-            said = subprocess.run([*words, "--memory", "1MB"], capture_output=True, text=True)
+            probe = [*words, "--memory", "1MB", "--dry-run"]
+            said = subprocess.run(probe, capture_output=True, text=True)
             self.memory[kind] = float(re.split(" needs? ", said.stderr)[1].split()[0])
         return [*words, "--memory", f"{self.memory[kind]:.3f}GB"]
 
