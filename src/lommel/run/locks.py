@@ -43,7 +43,8 @@ def only_run(output, is_shared=False):
     with ExitStack() as stack:
         with telling_unwritable(path):
             stack.callback(_remove_empty, [one for one in path.parents if not one.exists()])
-            path.parent.mkdir(parents=True, exist_ok=True)
+            if not path.parent.exists():
+                path.parent.mkdir(parents=True, exist_ok=True)
             lock = _take(file, path, is_shared)
         if lock is not None:
             stack.callback(_give_back, file, lock)
