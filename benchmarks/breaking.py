@@ -242,7 +242,7 @@ def killed(command, engine, folder, kills, table, number=signal.SIGKILL):
                 running.end(number)
                 done += 1
                 orphans += len(running.left_behind()) if done % 4 == 0 else 0
-                if "Traceback" in running.said and number == signal.SIGKILL:
+                if "Traceback" in running.said:
                     followed[f"traceback: {running.said.splitlines()[-1][:150]}"] += 1
                 continue
             what, is_good = verdict(command, output, status, running.said)
