@@ -304,7 +304,9 @@ def test_full_disk_is_an_error_and_leaves_nothing(tmp_path):
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limit[1]))
     try:
-        with pytest.raises(InputError, match=r"a\.tif cannot be written: .*File too large"):
+        with pytest.raises(
+            InputError, match=r"a\.tif cannot be written: .*File too large; \d+\.\d MB of"
+        ):
             write_raster(tmp_path / "a.tif", noise, GRID, "noise")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)

@@ -2,6 +2,10 @@
 
 import json
 import os
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from multiprocessing import active_children
 
@@ -102,9 +106,16 @@ def test_job_that_fails_is_told_and_the_others_are_kept(tmp_path):
         with pytest.raises(LommelError, match=r"1 of 3 jobs of the step 'roots'.*\n.*job 1: Value"):
             jobs.each(int, ["1", "two", "3"], "roots")
         assert list((tmp_path / "roots").glob("0*")) != []
-        (job_folder(tmp_path / "roots", 0) / parts.RESULTS).write_bytes(b"")
-        with pytest.raises(LommelError, match="Remove that folder"):
-            list(jobs.each(int, ["1", "2", "3"], "roots"))
+
+
+@pytest.mark.parametrize("damage", ["cut off", "zeroed"])
+def test_results_that_are_damaged_are_made_anew(tmp_path, damage):
+    with open_engine(Tiling()) as engine:
+        jobs = Parts(tmp_path, "digest", Tiling(), engine, 1, lambda items, *_, **__: items)
+        assert list(jobs.each(abs, [-1, -2], "sizes")) == [1, 2]
+        results = job_folder(tmp_path / "sizes", 0) / parts.RESULTS
+        results.write_bytes(b"" if damage == "cut off" else bytes(results.stat().st_size))
+        assert list(jobs.each(abs, [-1, -2], "sizes")) == [1, 2]
 
 
 DIES_ONCE = """
@@ -124,6 +135,63 @@ def test_worker_that_dies_takes_no_result_along(tmp_path):
         assert list(jobs.each(exec, codes, "risk")) == [None, None]
         assert list(jobs.each(abs, [-1, -2], "after it")) == [1, 2]
     assert not active_children()
+
+
+def test_job_that_always_kills_its_worker_takes_no_other_along(tmp_path):
+    """With one pool for all, whoever was at work or waited failed too, twice, and with it all."""
+    tiling = Tiling(engine="processes")
+    codes = ["import time; time.sleep(0.5)"] * 4
+    codes[1] = "import os; os.kill(os.getpid(), 9)"
+    with open_engine(tiling) as engine:
+        jobs = Parts(tmp_path, "digest", tiling, engine, 1, lambda items, *_, **__: items)
+        with pytest.raises(LommelError, match=r"1 of 4 jobs.*\n  job 1: its worker is gone: ended"):
+            jobs.each(exec, codes, "risk")
+
+
+AT_WORK = """
+import signal, sys
+from pathlib import Path
+from lommel.run.parts import Parts
+from lommel.run.tiles_engines import open_engine
+from lommel.run.tiles_plan import Tiling
+
+code = "import os, pathlib, time; pathlib.Path({!r}).write_text(str(os.getpid())); time.sleep(600)"
+if __name__ == "__main__":
+    tiling, folder = Tiling(engine="processes"), Path(sys.argv[1])
+    with open_engine(tiling) as engine:
+        jobs = Parts(folder, "digest", tiling, engine, 1, lambda items, *_, **__: items)
+        jobs.each(exec, [code.format(str(folder / "pid"))], "wait")
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_workers_end_with_the_command_however_it_ends(tmp_path, number):
+    """They would go on beside the run that comes next, or wait for ever for more to do."""
+    script, pid = tmp_path / "script.py", tmp_path / "pid"
+    script.write_text(AT_WORK)
+    command = subprocess.Popen(
+        [sys.executable, str(script), str(tmp_path)], stderr=subprocess.PIPE, text=True
+    )
+    within(60, lambda: pid.exists() and pid.read_text())
+    command.send_signal(number)
+    said = command.communicate(timeout=60)[1]
+    assert said.count("Traceback") == (number == signal.SIGINT)  # its own, not of workers
+    within(20, lambda: not is_alive(int(pid.read_text())))
+
+
+def within(seconds, happens):
+    end = time.monotonic() + seconds
+    while not happens():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def is_alive(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rsplit(")", 1)[1].split()[0] != "Z"  # its parent is gone
+    except OSError:
+        return False
 
 
 def test_what_cannot_be_shared_is_refused(ground, tmp_path):

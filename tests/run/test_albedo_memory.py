@@ -14,9 +14,12 @@ from lommel.errors import InputError, LommelError
 from lommel.estimate import albedo_samples
 from lommel.run import albedo_plan, albedo_records, mixed_scene
 from lommel.run.albedo import run_albedo
+from lommel.run.albedo_array import merge_albedo, prepare_albedo, solve_albedo_share
 from lommel.run.albedo_plan import plan_albedo
 from lommel.run.albedo_records import work_folder
 from lommel.run.mixed_scene import Place, PlacedScene, place_scene
+from lommel.run.records import save_part
+from lommel.run.shares import Share
 from lommel.run.tiles_plan import Tiling
 from lommel.scene.grid import Window, grid_from_bounds, read_crs
 
@@ -129,6 +132,84 @@ def break_off(files, output):
     with pytest.raises(KeyboardInterrupt):
         run_albedo(files, output, few_steps(), progress=progress)
     assert (work_folder(output) / "photometry").is_dir() and not output.exists()
+
+
+@pytest.mark.parametrize("is_array", [False, True])
+def test_what_a_crash_has_damaged_is_made_anew(ground, tmp_path, unbroken, is_array):
+    """Files were cut off, zeroed or gone: a traceback, or products made of zeros."""
+    output, work = tmp_path / "out", work_folder(tmp_path / "out")
+    array = files_of(ground), output, few_steps(), None, Tiling()
+    if is_array:
+        prepare_albedo(*array)
+        solve_albedo_share(*array, Share(1, 1))
+    else:
+        break_off(files_of(ground), output)
+    (work / "heights-00000" / "rows").unlink()
+    for name in ("heights-00001/rows", "image-00000/rows"):
+        (work / name).write_bytes(bytes((work / name).stat().st_size))
+    (work / "image-00001" / "rows").write_bytes(b"")
+    (work / "photometry" / "record.json").write_text('{"digest": ')
+    for results in work.glob("pass-1-block/*/results.pickle"):
+        results.write_bytes(b"")
+    if is_array:
+        prepare_albedo(*array)
+        solve_albedo_share(*array, Share(1, 1))
+        merge_albedo(output)
+    else:
+        run_albedo(files_of(ground), output, few_steps())
+    assert content(output) == unbroken
+    assert [path.name for path in tmp_path.glob(".out*")] == []
+
+
+@pytest.mark.parametrize("step", ["terrain", "images"])
+@pytest.mark.parametrize("damage", ["gone", "cut off", "replaced"])
+def test_input_that_changes_while_it_is_read_ends_the_run(ground, tmp_path, unbroken, step, damage):
+    """Nothing that was read of it is kept, and no map is made without it."""
+    output, path = tmp_path / "out", ground.initial_dem if step == "terrain" else ground.images[1]
+    before = path.read_bytes()
+
+    def progress(items, name, total=None, at_once=1):
+        if name == step:
+            path.unlink()
+        if name == step and damage != "gone":
+            path.write_bytes(before[:4000] if damage == "cut off" else before)
+        return items
+
+    try:
+        with pytest.raises(LommelError, match=re.escape(path.name)):
+            run_albedo(files_of(ground), output, few_steps(), progress=progress)
+    finally:
+        path.write_bytes(before)
+    kept = {folder.name for folder in work_folder(output).iterdir()}
+    assert not kept & {"photometry", "heights-00000" if step == "terrain" else "image-00001"}
+    run_albedo(files_of(ground), output, few_steps())
+    assert content(output) == unbroken
+
+
+def test_image_that_a_worker_of_an_earlier_run_replaces_is_noticed(ground, tmp_path):
+    """A Dask worker goes on when its run is killed, and leaves an image of another grid."""
+    output = tmp_path / "out"
+
+    def progress(items, name, total=None, at_once=1):
+        yield from items
+        if name == "maps, block":
+            save_part(work_folder(output) / "image-00001", {}, {"digest": "of the earlier run"})
+
+    with pytest.raises(LommelError, match="image-00001 was replaced meanwhile, by a worker"):
+        run_albedo(files_of(ground), output, few_steps(), progress=progress)
+    assert not output.exists()
+
+
+def test_kept_rows_damaged_while_a_run_is_at_work_are_told(ground, tmp_path):
+    output = tmp_path / "out"
+
+    def progress(items, name, total=None, at_once=1):
+        if name == "pass 1, block":
+            (work_folder(output) / "image-00001" / "rows").write_bytes(bytes(8))
+        return items
+
+    with pytest.raises(LommelError, match="image-00001/rows is damaged .* The same command"):
+        run_albedo(files_of(ground), output, few_steps(), progress=progress)
 
 
 @pytest.mark.parametrize("change", ["settings", "inputs"])

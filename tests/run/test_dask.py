@@ -5,8 +5,9 @@ import signal
 
 import pytest
 from distributed import LocalCluster
+from distributed.comm import CommClosedError
 
-from lommel.errors import InputError
+from lommel.errors import InputError, LommelError
 from lommel.run import tiles_dask
 from lommel.run.shape_from_shading import run_shape_from_shading
 from lommel.run.tiles_plan import Tiling, work_folder
@@ -48,3 +49,25 @@ def test_a_scheduler_that_does_not_answer_is_named_before_anything_is_solved(
     with pytest.raises(InputError, match="tcp://127.0.0.1:9: no scheduler answers"):
         run_shape_from_shading(files_of(tile_scene), tmp_path / "out", tiling=tiling)
     assert not list(tmp_path.iterdir())
+
+
+class Losing:
+    """A client of a cluster that loses some workers one by one."""
+
+    def __init__(self, count):
+        self.left, self.told = count, []
+
+    def register_plugin(self, plugin):
+        self.left -= 1
+        if self.left >= 0:
+            raise CommClosedError("in <TCP (closed) ConnectionPool.register_worker_plugin>")
+        self.told.append(plugin.name)
+
+
+def test_worker_that_is_lost_while_it_is_told_what_to_hold_does_not_end_the_run():
+    """A worker killed in this moment ended the command with a traceback."""
+    client = Losing(2)
+    tiles_dask.register_one_tile(client)
+    assert client.told == ["lommel-one-tile-at-a-time"]
+    with pytest.raises(LommelError, match="workers of the Dask cluster end as soon as"):
+        tiles_dask.register_one_tile(Losing(9))

@@ -424,7 +424,7 @@ def write_raster(path, values, grid, description, unit="", nodata=np.nan, valid=
             partial.write_bytes(memory.getbuffer())
         os.replace(partial, path)
     except GDAL_ERRORS as error:
-        raise InputError(f"{path} cannot be written: {error}") from error
+        raise _unwritable(path, error) from error
     finally:
         with suppress(OSError):
             partial.unlink()
@@ -476,11 +476,19 @@ def raster_writer(path, grid, description, unit="", dtype=np.float32, nodata=np.
             rasterio.shutil.copy(file, partial, **COG | {"overview_resampling": shrink})
         os.replace(partial, path)
     except GDAL_ERRORS as error:
-        raise InputError(f"{path} cannot be written: {error}") from error
+        raise _unwritable(path, error) from error
     finally:
         for leftover in (scratch, partial):
             with suppress(OSError):
                 leftover.unlink()
+
+
+def _unwritable(path, error):
+    """What is to be raised, with the free space that GDAL says nothing of."""
+    free = shutil.disk_usage(next(f for f in path.absolute().parents if f.exists())).free
+    return InputError(
+        f"{path} cannot be written: {error}; {free / 1e6:.1f} MB of its disk are free."
+    )
 
 
 def _refuse_full_disk(path, grid, dtype):

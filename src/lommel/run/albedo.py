@@ -26,9 +26,9 @@ from lommel.run.inputs import GridSettings, SceneFiles, Skipped
 from lommel.run.mixed_scene import PlacedScene, place_scene, raw_cameras, read_placed
 from lommel.run.parts import Parts
 from lommel.run.products import RunRecord, output_folder
-from lommel.run.records import digest_of
+from lommel.run.records import digest_of, refuse_foreign, stamps
 from lommel.run.register import settle_cameras
-from lommel.run.stored_rows import Held
+from lommel.run.stored_rows import Held, StoredRows
 from lommel.run.tiles_engines import check_engine, open_engine
 from lommel.run.tiles_plan import Tiling
 
@@ -72,6 +72,8 @@ class AlbedoRun:
         The settings as ``run.json`` shows them.
     inputs : list of dict
         Path, bytes and digest of each input file.
+    stamps : dict of str to (int, int)
+        Size and time of change of each, before its digest was taken.
     lost : list of Skipped
         Images that could not be registered.
     remark : str
@@ -84,6 +86,7 @@ class AlbedoRun:
     settings: AlbedoSettings
     asked: dict
     inputs: list
+    stamps: dict
     lost: list
     remark: str
     version: str = __version__
@@ -130,12 +133,12 @@ def run_albedo(
     """
     settings, tiling = settings or AlbedoSettings(), tiling or Tiling()
     check_engine(tiling)
-    with output_folder(output, overwrite) as folder:
+    work = work_folder(output)
+    with output_folder(output, overwrite, work) as folder:
         record = RunRecord("albedo", asked_for(settings, grid_settings, registers))
         with record.stage("place"):
             run = place_run(files, folder, settings, grid_settings, registers, record, progress)
             plan = plan_albedo(run.placed, settings, tiling)
-            work = work_folder(output)
             kept = Kept(work, run.digest) if plan.waits_on_disk else Held()
             kept.begin(plan)
         if plan.is_shared:
@@ -144,7 +147,6 @@ def run_albedo(
                 write_products(run, plan, jobs, kept, folder, record)
         else:
             write_products(run, plan, InThreads(progress), kept, folder, record)
-    kept.remove()
     return record.results
 
 
@@ -175,10 +177,11 @@ def place_run(files, folder, settings, grid_settings, registers, record, progres
     """
     tables = (files.sun_positions, files.spacecraft_positions)
     inputs = [*files.images, *files.dems, *files.cameras, *filter(None, tables)]
+    before = stamps(inputs)
     record.add_inputs(inputs, progress)
     settled, *lost = settle_cameras(files, folder, registers, raw_cameras(files), progress)
     placed = place_scene(settled, grid_settings, progress=progress)
-    return AlbedoRun(placed, settings, dict(record.settings), list(record.inputs), *lost)
+    return AlbedoRun(placed, settings, dict(record.settings), list(record.inputs), before, *lost)
 
 
 def photometry_of(run, plan, jobs, kept):
@@ -197,7 +200,7 @@ def photometry_of(run, plan, jobs, kept):
     fit : function ()
         Gives `Problem` and `Photometry`.
     """
-    scene = read_placed(run.placed, jobs, kept.rows)
+    scene = read_placed(run.placed, jobs, kept.rows, run.stamps)
     names = [observation.name for observation in scene.observations]
     remember = None if kept.photometry is None else partial(kept.photometry, names=names)
     given = scene.observations, scene.grid, scene.heights, run.settings
@@ -220,6 +223,7 @@ def write_products(run, plan, jobs, kept, folder, record):
     with record.stage("solve"), plan.limits(), Products(folder, scene.grid) as products:
         problem, found = fit()
         result = collect(problem, found, make_maps(problem, found), products.take)
+    refuse_foreign(stored_in(scene), run.digest)
     with record.stage("write"):
         names = [observation.name for observation in scene.observations]
         reasons = zip(names, result.reasons, strict=True)
@@ -231,6 +235,12 @@ def write_products(run, plan, jobs, kept, folder, record):
     record.history = result.history
     record.outcome = {"name": result.outcome, "sentence": result.advice + run.remark}
     record.write(folder)
+
+
+def stored_in(scene):
+    """Folders of what waits on the disk of a scene."""
+    rows = [*getattr(scene.heights, "bands", ()), *(one.measured for one in scene.observations)]
+    return [one.path.parent for one in rows if isinstance(one, StoredRows)]
 
 
 def _write_exposures(path, names, result, skipped):

@@ -16,6 +16,7 @@ from lommel.progress import silent
 from lommel.run.albedo import AlbedoRun, asked_for, photometry_of, place_run, write_products
 from lommel.run.albedo_plan import plan_albedo
 from lommel.run.albedo_records import Kept, work_folder
+from lommel.run.locks import only_run
 from lommel.run.parts import Parts
 from lommel.run.products import RunRecord, output_folder
 from lommel.run.records import RUN, disk_errors, load_pickled, write_whole
@@ -47,13 +48,13 @@ def prepare_albedo(files, output, settings, grid_settings, tiling, progress=sile
             "so. Take --engine dask, or the default solver, which has four."
         )
     record = RunRecord("albedo", asked_for(settings, grid_settings))
-    with TemporaryDirectory() as unused:  # no camera is registered
+    with only_run(output), TemporaryDirectory() as unused:  # no camera is registered
         terms = Path(unused), settings, grid_settings, False, record, progress
         run = place_run(files, *terms)
-    kept = Kept(work_folder(output), run.digest)
-    kept.begin(plan_albedo(run.placed, settings, tiling, is_shared=True))
-    with disk_errors(kept.folder):
-        write_whole(kept.folder / RUN, pickle.dumps(run))
+        kept = Kept(work_folder(output), run.digest)
+        kept.begin(plan_albedo(run.placed, settings, tiling, is_shared=True))
+        with disk_errors(kept.folder):
+            write_whole(kept.folder / RUN, pickle.dumps(run))
     return len(run.placed.places)
 
 
@@ -78,7 +79,7 @@ def solve_albedo_share(files, output, settings, grid_settings, tiling, share, pr
     given = [*files.images, *files.dems, *files.cameras, *filter(None, tables)]
     refuse_changes(run, asked_for(settings, grid_settings), given, work, share)
     plan, kept = plan_albedo(run.placed, settings, tiling, is_shared=True), Kept(work, run.digest)
-    with open_engine(tiling) as engine, plan.limits():
+    with only_run(output, is_shared=True), open_engine(tiling) as engine, plan.limits():
         terms = work, run.digest, tiling, engine, plan.most_threads, progress
         _, fit = photometry_of(run, plan, Parts(*terms, share), kept)
         make_maps(*fit())
@@ -107,8 +108,10 @@ def merge_albedo(output, overwrite=False, progress=silent):
     run: AlbedoRun = load_pickled(work_folder(output) / RUN)
     plan = plan_albedo(run.placed, run.settings, Tiling(), is_shared=True)
     kept, record = Kept(work_folder(output), run.digest), RunRecord("albedo", run.asked, run.inputs)
-    with output_folder(output, overwrite) as folder, open_engine(Tiling()) as engine:
+    with (
+        output_folder(output, overwrite, kept.folder) as folder,
+        open_engine(Tiling()) as engine,
+    ):
         terms = kept.folder, run.digest, Tiling(), engine, plan.most_threads, progress
         write_products(run, plan, Parts(*terms, is_complete=True), kept, folder, record)
-    kept.remove()
     return record.results

@@ -12,18 +12,22 @@ import numpy as np
 
 from lommel.estimate.albedo import Photometry
 from lommel.estimate.albedo_arrays import State
+from lommel.run.locks import remove
 from lommel.run.records import (
     clear_partial,
     digest_of,
     disk_errors,
     is_done,
+    is_sound,
     new_part,
     read_record,
     refuse_full,
-    remove_work,
     save_part,
 )
 from lommel.run.stored_rows import StoredRows
+
+# jobs of workers that have left rows are done again: that reads whether the rows are as they were
+STEPS_WITH_ROWS = ("terrain", "images")
 
 
 @dataclass(frozen=True)
@@ -51,13 +55,15 @@ class Kept:
         with disk_errors(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
         clear_partial(self.folder)
+        for step in STEPS_WITH_ROWS:
+            remove(self.folder / step)
         present = sum(path.stat().st_size for path in self.folder.rglob("rows"))
         refuse_full(self.folder, plan.disk - present)
 
     def rows(self, name, shape, parts):
         """An array from its parts, as `Held.rows`; they are not asked for when it is there."""
         folder = self.folder / name
-        if not is_done(folder, self.digest):
+        if not is_sound(folder, self.digest):
             with disk_errors(folder), new_part(folder, {"digest": self.digest}) as partial:
                 with open(partial / "rows", "wb") as file:
                     for part in parts:
@@ -80,10 +86,6 @@ class Kept:
         with disk_errors(folder):
             save_part(folder, {}, {"digest": digest} | _content(found))
         return found
-
-    def remove(self):
-        """Remove all, when the products are in place."""
-        remove_work(self.folder)
 
 
 def work_folder(output):

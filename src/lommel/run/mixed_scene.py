@@ -31,6 +31,7 @@ from lommel.run.inputs import (
 )
 from lommel.run.orthoproject import common_gsd, ortho_grid
 from lommel.run.raw_images import RawImage, Terrain, read_raw_images, show_pixels, view_window
+from lommel.run.records import refuse_changed
 from lommel.run.stored_rows import Held, stacked
 from lommel.scene.body import MOON
 from lommel.scene.geometry import Observation
@@ -158,7 +159,7 @@ def place_scene(files, grid_settings=None, body=MOON, progress=silent):
     return PlacedScene(grid, terrain, places, tables, skipped)
 
 
-def read_placed(placed, jobs=None, store=Held.rows):
+def read_placed(placed, jobs=None, store=Held.rows, stamps=None):
     """Terrain and images of a placed scene.
 
     Parameters
@@ -169,17 +170,21 @@ def read_placed(placed, jobs=None, store=Held.rows):
     store : function (name, shape, parts)
         Puts the arrays of an iterator, which follow each other from north to south, together to one
         of a shape; `Held.rows` in memory.
+    stamps : dict, optional
+        From `lommel.run.records.stamps`; a file that is not as they tell is an error.
 
     Returns
     -------
     scene : Scene
     """
-    jobs = jobs or InThreads()
+    jobs, stamps = jobs or InThreads(), stamps or {}
     common = replace(placed, places=[], skipped=[])  # a job needs no place but its own
     grid, skipped = placed.grid, list(placed.skipped)
     parts = list(bands(grid.window, max(1, POSTS_AT_ONCE // grid.shape[1])))
     numbered = list(enumerate(parts))
-    found = jobs.each(ReadTerrain(common, store), numbered, "terrain", BANDS_TOGETHER, threads=1)
+    found = jobs.each(
+        ReadTerrain(common, store, stamps), numbered, "terrain", BANDS_TOGETHER, threads=1
+    )
     found = list(found)
     if not any(is_known for _, is_known in found):
         raise InputError(
@@ -188,7 +193,9 @@ def read_placed(placed, jobs=None, store=Held.rows):
         )
     heights = stacked([rows for rows, _ in found])
     numbered = list(enumerate(placed.places))
-    images = list(jobs.each(ReadImage(common, store, heights), numbered, "images", threads=1))
+    images = list(
+        jobs.each(ReadImage(common, store, heights, stamps), numbered, "images", threads=1)
+    )
     skipped += [image for image in images if isinstance(image, Skipped)]
     observations = [image for image in images if not isinstance(image, Skipped)]
     if not observations:
@@ -204,11 +211,13 @@ class ReadTerrain:
     ----------
     placed : PlacedScene
     store : function
+    stamps : dict
         As of `read_placed`.
     """
 
     placed: PlacedScene
     store: Callable
+    stamps: dict
 
     def __call__(self, item):
         """Heights of a band and whether any is known, from its number and its window."""
@@ -218,6 +227,7 @@ class ReadTerrain:
 
     def _heights(self, part):
         yield self.placed.terrain.heights(self.placed.grid.cut(part))
+        refuse_changed(self.stamps, self.placed.terrain.paths)
 
 
 @dataclass(frozen=True)
@@ -231,22 +241,30 @@ class ReadImage:
         As of `read_placed`.
     heights : array (rows, cols), m
         Or what waits on the disk.
+    stamps : dict
+        As of `read_placed`.
     """
 
     placed: PlacedScene
     store: Callable
     heights: np.ndarray
+    stamps: dict
 
     def __call__(self, item):
         """`Observation`, or `Skipped` where it cannot be used, from its number and its `Place`."""
         number, place = item
         try:
             sun, craft, saturation = _circumstances(place, self.placed)
-            rows = _checked_rows(place, self.placed, self.heights)
+            rows = self._unchanged(place, _checked_rows(place, self.placed, self.heights))
             measured = self.store(f"image-{number:05d}", place.window.shape, rows)
         except (InputError, GeometryError) as error:  # a full disk is none of them
+            refuse_changed(self.stamps, [place.path])
             return Skipped(place.path.name, str(error))
         return Observation(place.path.name, place.window, measured, sun, craft, saturation)
+
+    def _unchanged(self, place, rows):
+        yield from rows
+        refuse_changed(self.stamps, [place.path])
 
 
 def bands(window, rows):

@@ -15,7 +15,17 @@ from numba import get_num_threads
 from lommel import __version__
 from lommel.errors import LommelError
 from lommel.jobs import in_order
-from lommel.run.records import digest_of, disk_errors, is_done, load_pickled, new_part, write_whole
+from lommel.run.locks import remove
+from lommel.run.records import (
+    digest_of,
+    disk_errors,
+    is_done,
+    is_sound,
+    load_pickled,
+    new_part,
+    refuse_foreign,
+    write_whole,
+)
 from lommel.run.shares import Share
 from lommel.run.tiles_engines import solve_all
 from lommel.run.tiles_plan import Tiling
@@ -87,7 +97,8 @@ class Parts:
         folder = self.folder / re.sub(r"\W+", "-", name)
         digest = digest_of([self.digest, name])
         jobs = [items[first : first + together] for first in range(0, len(items), together)]
-        done = [is_done(job_folder(folder, number), digest) for number in range(len(jobs))]
+        is_kept = is_sound if self.share is None else is_done  # shares read too much otherwise
+        done = [is_kept(job_folder(folder, number), digest) for number in range(len(jobs))]
         left = [number for number in self._in_turn(len(jobs)) if not done[number]]
         if left and self.is_complete:
             raise LommelError(
@@ -110,7 +121,7 @@ class Parts:
                     + "\n".join(f"  job {number}: {why}" for number, why in failed.items())
                     + f"\nThe others wait in {folder}: the same command goes on from there."
                 )
-        return _results(folder, len(jobs))
+        return _results(folder, len(jobs), digest)
 
     def _in_turn(self, count):
         if self.share is None:
@@ -157,12 +168,15 @@ def do_job(folder, number):
     return None
 
 
-def _results(folder, count):
+def _results(folder, count, digest):
     for number in range(count):
         try:
-            yield from pickle.loads((job_folder(folder, number) / RESULTS).read_bytes())
-        except (OSError, pickle.PickleError, EOFError, AttributeError, ImportError) as error:
+            results = pickle.loads((job_folder(folder, number) / RESULTS).read_bytes())
+        except Exception as error:  # bytes that are none of a pickle raise whatever they like
+            remove(job_folder(folder, number))
             raise LommelError(
-                f"{job_folder(folder, number)} cannot be read ({error}). Remove that folder; the "
-                "same command makes it anew."
+                f"{job_folder(folder, number)} was damaged ({error}) and is removed. The same "
+                "command makes it anew."
             ) from error
+        refuse_foreign([job_folder(folder, number)], digest)
+        yield from results

@@ -10,9 +10,8 @@ import math
 import os
 import platform
 import resource
-import shutil
 import time
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -21,13 +20,21 @@ from pathlib import Path
 from lommel import __version__
 from lommel.errors import InputError, LommelError
 from lommel.progress import silent
+from lommel.run.locks import (
+    clear_leftovers,
+    me,
+    only_run,
+    remove,
+    restore_replaced,
+    telling_unwritable,
+)
 
 ANGLES = ("max_incidence", "max_emission", "terrain_roughness")  # settings in rad
 PACKAGES = ("numpy", "numba", "scipy", "rasterio", "pyproj")
 
 
 @contextmanager
-def output_folder(path, overwrite=False):
+def output_folder(path, overwrite=False, work=None):
     """A folder to write into that becomes ``path`` when the block ends well.
 
     Parameters
@@ -35,6 +42,8 @@ def output_folder(path, overwrite=False):
     path : path
     overwrite : bool
         Replace the folder of an earlier run; without it a folder that holds something is an error.
+    work : Path, optional
+        What a broken run needs to go on; it goes when ``path`` is there.
 
     Yields
     ------
@@ -42,26 +51,41 @@ def output_folder(path, overwrite=False):
         Where to write.
     """
     path = Path(os.path.realpath(path))
-    staging = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    new_parents = [parent for parent in path.parents if not parent.exists()]
+    staging = path.with_name(f".{path.name}.{me()}.partial")
+    with only_run(path) as is_alone:
+        with telling_unwritable(path):
+            if is_alone:
+                restore_replaced(path)
+            _refuse_filled(path, overwrite)
+            if is_alone:
+                clear_leftovers(path)
+            remove(staging)
+            staging.mkdir()
+        try:
+            yield staging
+        except BaseException:
+            remove(staging)
+            raise
+        _take_name(staging, path, overwrite)
+        if work is not None and work.exists():
+            _flush(path)
+            remove(work)
+
+
+def _flush(folder):
+    """Have the disk take a folder in, before what it was made from goes."""
     try:
-        _refuse_filled(path, overwrite)
-        shutil.rmtree(staging, ignore_errors=True)
-        staging.mkdir(parents=True)
+        for path in (*folder.rglob("*"), folder, folder.parent):
+            descriptor = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
     except OSError as error:
-        raise InputError(
-            f"--output {path} cannot be written: {error.strerror}. Name a folder on a disk "
-            "with space where you may write."
+        raise LommelError(
+            f"{path} may not have reached its disk: {error.strerror}. What it was made from is "
+            "kept: when the disk is well, the same command with --overwrite writes it again."
         ) from error
-    try:
-        yield staging
-    except BaseException:
-        shutil.rmtree(staging, ignore_errors=True)
-        for parent in new_parents:
-            with suppress(OSError):
-                parent.rmdir()
-        raise
-    _take_name(staging, path, overwrite)
 
 
 def _refuse_filled(path, overwrite):
@@ -84,7 +108,7 @@ def _refuse_filled(path, overwrite):
 
 def _take_name(staging, path, overwrite):
     """Rename the folder to ``path``; whatever fails, what stood there stands there again."""
-    replaced = path.with_name(f".{path.name}.{os.getpid()}.replaced")
+    replaced = path.with_name(f".{path.name}.{me()}.replaced")
     try:
         if overwrite and path.exists():
             path.rename(replaced)
@@ -97,7 +121,9 @@ def _take_name(staging, path, overwrite):
     finally:
         if replaced.exists() and not path.exists():
             replaced.rename(path)
-    shutil.rmtree(replaced, ignore_errors=True)
+    if replaced.exists():
+        replaced.rename(staging)  # a name that is never given back
+        remove(staging)
 
 
 @dataclass

@@ -25,7 +25,7 @@ from lommel.run.inputs import GridSettings, SceneFiles
 from lommel.run.photometry import read_known
 from lommel.run.products import RunRecord, output_folder
 from lommel.run.selection import survey_images
-from lommel.run.tiles_plan import plan_tiles
+from lommel.run.tiles_plan import plan_tiles, work_folder
 from lommel.run.views import read_views
 from lommel.scene.grid import Grid
 from lommel.scene.masks import MaskSettings
@@ -112,7 +112,7 @@ def run_shape_from_shading(
         )
     model = reflectance_model(settings.reflectance)
     record = RunRecord("sfs", asdict(settings) | {"grid": asdict(grid_settings or GridSettings())})
-    with output_folder(output, overwrite) as folder:
+    with output_folder(output, overwrite, work_folder(output)) as folder:
         with record.stage("read"):
             settled, lost, remark = _settled(files, folder, settings.registers, progress)
             with step(progress, "footprints"):

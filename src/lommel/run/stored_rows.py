@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from lommel.errors import LommelError
+
 
 class Held:
     """Keeps what a run has found in memory, so that a run that is broken off begins anew.
@@ -40,9 +42,6 @@ class Held:
             values[row : row + len(part)] = part
             row += len(part)
         return values
-
-    def remove(self):
-        """Nothing is left."""
 
 
 class Rows:
@@ -87,8 +86,14 @@ class StoredRows(Rows):
 
     def _read(self, first, last):
         size, width = last - first, self.shape[1]
-        values = np.fromfile(self.path, np.float32, size * width, offset=4 * first * width)
-        return values.reshape(size, width)
+        try:
+            values = np.fromfile(self.path, np.float32, size * width, offset=4 * first * width)
+            return values.reshape(size, width)
+        except (OSError, ValueError) as error:  # missing, or shorter
+            raise LommelError(
+                f"{self.path} is damaged ({error}). The same command makes it anew; of a job "
+                "array that with --tiles 0/N, before the shares."
+            ) from error
 
 
 @dataclass(frozen=True)

@@ -23,11 +23,14 @@ from lommel.run.records import (
     digest_of,
     disk_errors,
     is_done,
+    is_sound,
     read_array,
     read_record,
+    refuse_changed,
+    refuse_foreign,
     refuse_full,
-    remove_work,
     save_part,
+    stamps,
 )
 from lommel.run.tiles_engines import check_engine, solve_all
 from lommel.run.tiles_plan import Tiling, plan_tiles, work_folder
@@ -86,11 +89,28 @@ def run_tiles(
         prepare(run, work, progress)
     with record.stage("tiles"):
         solve_tiles(work, run.plan.tiles, tiling, progress)
+    write_products(run, work, folder, record, progress)
+    return record.results
+
+
+def write_products(run, work, folder, record, progress=silent):
+    """Blend the tiles into products, and write the record of the run.
+
+    Parameters
+    ----------
+    run : TiledRun
+        All of whose tiles are done.
+    work : Path
+    folder : Path
+        That the products are written to.
+    record : RunRecord
+    progress : callable
+    """
     with record.stage("write"), disk_errors(folder):
         finish_products(run, work, folder, record, load_known(work), progress)
+    parts = [part_folder(work, tile.number) for tile in run.plan.tiles]
+    refuse_foreign([work / "scene", *parts], run.digest)
     record.write(folder)
-    remove_work(work)
-    return record.results
 
 
 def describe_run(files, footprints, lost, output, settings, grid_settings, tiling, progress=silent):
@@ -108,6 +128,7 @@ def describe_run(files, footprints, lost, output, settings, grid_settings, tilin
     record = RunRecord("sfs", asdict(settings) | {"grid": asdict(grid_settings or GridSettings())})
     tables = (files.sun_positions, files.spacecraft_positions, settings.albedo, settings.exposures)
     inputs = [*files.images, *files.dems, *files.cameras, *filter(None, tables)]
+    before = stamps(inputs)
     record.add_inputs(inputs, progress, footprints.unused(files))
     plan = plan_tiles(footprints, tiling, output)
     return TiledRun(
@@ -120,6 +141,7 @@ def describe_run(files, footprints, lost, output, settings, grid_settings, tilin
         ),
         record.settings,
         record.inputs,
+        before,
         [*lost, *footprints.skipped],
         digest_of(
             [record.settings, record.inputs, asdict(plan) | {"memory": None}, footprints.choice]
@@ -140,11 +162,12 @@ def prepare(run, work, progress=silent):
     with disk_errors(work):
         work.mkdir(parents=True, exist_ok=True)
         save_run(work, run)
-    if is_done(work / "scene", run.digest):
+    if is_sound(work / "scene", run.digest):
         return
     known, solution, skipped = prepare_scene(
         run.footprints, run.plan.stride, run.settings, progress
     )
+    _refuse_changed(run, run.footprints.used)
     with disk_errors(work):
         _save_known(work / "scene", known, solution, [*run.lost, *skipped], run.digest)
 
@@ -160,7 +183,7 @@ def solve_tiles(work, tiles, tiling, progress=silent):
     progress : callable
     """
     run, numbers = load_run(work), [tile.number for tile in tiles]
-    left = [n for n in numbers if not is_done(part_folder(work, n), run.digest)]
+    left = [n for n in numbers if not is_sound(part_folder(work, n), run.digest)]
     failed = solve_all(solve_part, work, left, tiling, progress)
     if failed:
         raise LommelError(
@@ -190,6 +213,7 @@ def solve_part(work, number):
         refuse_full(work, size_on_disk(tile, run.grid.shape))
         files = run.footprints.within(tile.outer)
         products, record = solve_tile(files, run.grid, tile, load_known(work), run.settings)
+        _refuse_changed(run, files)
         record |= {
             "digest": run.digest,
             "seconds": round(time.perf_counter() - start, 3),
@@ -200,6 +224,10 @@ def solve_part(work, number):
     except Exception as error:  # whatever it is: the other tiles go on
         return str(error) if isinstance(error, LommelError) else f"{type(error).__name__}: {error}"
     return None
+
+
+def _refuse_changed(run, files):
+    refuse_changed(run.stamps, [*files.images, *files.dems, *filter(None, files.cameras)])
 
 
 def load_known(work):

@@ -10,14 +10,14 @@ from pathlib import Path
 from lommel.errors import InputError, LommelError
 from lommel.progress import silent, step
 from lommel.run.inputs import GridSettings
+from lommel.run.locks import only_run
 from lommel.run.products import RunRecord, output_folder
-from lommel.run.records import RUN, disk_errors, is_done, remove_work
+from lommel.run.records import RUN, is_done, is_sound
 from lommel.run.selection import survey_images
 from lommel.run.shares import prepare_again, refuse_changes, refuse_registration
-from lommel.run.tiles import describe_run, load_known, prepare, solve_tiles
+from lommel.run.tiles import describe_run, prepare, solve_tiles, write_products
 from lommel.run.tiles_engines import check_engine
 from lommel.run.tiles_plan import work_folder
-from lommel.run.tiles_products import finish_products
 from lommel.run.tiles_records import load_run, part_folder
 
 
@@ -39,15 +39,16 @@ def prepare_array(files, output, settings, grid_settings, tiling, progress=silen
     tiles : int
     """
     refuse_registration(settings.registers)
-    with step(progress, "footprints"):
-        footprints = survey_images(files, grid_settings, settings, output)
-    run = describe_run(files, footprints, [], output, settings, grid_settings, tiling, progress)
-    if not run.plan.is_tiled:
-        raise InputError(
-            "The scene fits in memory in one piece, so there is nothing to share. Leave --tiles "
-            "out, or give less --memory."
-        )
-    prepare(run, work_folder(output), progress)
+    with only_run(output):
+        with step(progress, "footprints"):
+            footprints = survey_images(files, grid_settings, settings, output)
+        run = describe_run(files, footprints, [], output, settings, grid_settings, tiling, progress)
+        if not run.plan.is_tiled:
+            raise InputError(
+                "The scene fits in memory in one piece, so there is nothing to share. Leave "
+                "--tiles out, or give less --memory."
+            )
+        prepare(run, work_folder(output), progress)
     return len(run.plan.tiles)
 
 
@@ -72,15 +73,18 @@ def solve_share(files, output, settings, grid_settings, tiling, share, progress=
             "first, and the shares when it is done."
         )
     check_engine(tiling)
-    run = load_run(work)
-    asked = asdict(settings) | {"grid": asdict(grid_settings or GridSettings())}
-    given = [*files.images, *files.dems, *files.cameras, files.sun_positions]
-    given += [files.spacecraft_positions, settings.albedo, settings.exposures]
-    refuse_changes(run, asked, [Path(path) for path in given if path], work, share)
-    if not is_done(work / "scene", run.digest):
-        raise LommelError(f"The scene in {work} is not prepared to the end. {prepare_again(share)}")
-    tiles = run.plan.tiles[share.number - 1 :: share.count]
-    solve_tiles(work, tiles, tiling, progress)
+    with only_run(output, is_shared=True):
+        run = load_run(work)
+        asked = asdict(settings) | {"grid": asdict(grid_settings or GridSettings())}
+        given = [*files.images, *files.dems, *files.cameras, files.sun_positions]
+        given += [files.spacecraft_positions, settings.albedo, settings.exposures]
+        refuse_changes(run, asked, [Path(path) for path in given if path], work, share)
+        if not is_done(work / "scene", run.digest):
+            raise LommelError(
+                f"The scene in {work} is not prepared to the end. {prepare_again(share)}"
+            )
+        tiles = run.plan.tiles[share.number - 1 :: share.count]
+        solve_tiles(work, tiles, tiling, progress)
     return len(tiles)
 
 
@@ -107,17 +111,18 @@ def merge_tiles(output, overwrite=False, progress=silent):
         )
     run = load_run(work)
     numbers = [tile.number for tile in run.plan.tiles]
-    missing = [n for n in numbers if not is_done(part_folder(work, n), run.digest)]
-    if missing or not is_done(work / "scene", run.digest):
+    if not is_sound(work / "scene", run.digest):
+        raise LommelError(
+            f"The scene in {work} is not prepared. Run --tiles 0/N again, then all shares."
+        )
+    missing = [n for n in numbers if not is_sound(part_folder(work, n), run.digest)]
+    if missing:
         shown = ", ".join(map(str, missing[:10])) + (", ..." if len(missing) > 10 else "")
         raise LommelError(
             f"{len(missing)} of {len(numbers)} tiles are not solved: {shown}. Tile n, from 0, is "
             "of share n mod N + 1 of N; run the missing shares again, those done take no time."
         )
     record = RunRecord("sfs", dict(run.asked), list(run.inputs))
-    with output_folder(output, overwrite) as folder:
-        with record.stage("write"), disk_errors(folder):
-            finish_products(run, work, folder, record, load_known(work), progress)
-        record.write(folder)
-    remove_work(work)
+    with output_folder(output, overwrite, work) as folder:
+        write_products(run, work, folder, record, progress)
     return record.results

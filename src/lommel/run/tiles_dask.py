@@ -18,6 +18,7 @@ from lommel.run.tiles_plan import cores
 
 TILE = "lommel-tile"  # the resource of which a worker has one
 PATIENCE = "30s"  # until a scheduler must have answered
+ATTEMPTS = 3  # to reach all workers
 
 
 class OneTileAtATime(WorkerPlugin):
@@ -46,8 +47,27 @@ def connected(tiling):
         scheduler is lost.
     """
     with _cluster(tiling) as cluster, _client(cluster) as client:
-        client.register_plugin(OneTileAtATime())
+        register_one_tile(client)
         yield partial(_submit, client)
+
+
+def register_one_tile(client):
+    """Tell the workers, also those that join later, that they have one tile at a time.
+
+    Parameters
+    ----------
+    client : Client
+    """
+    for _ in range(ATTEMPTS):
+        try:
+            client.register_plugin(OneTileAtATime())
+            return
+        except OSError as error:  # a worker was lost while it was told
+            lost = error
+    raise LommelError(
+        f"The workers of the Dask cluster end as soon as they are asked for something ({lost}). "
+        "Look at what they and their scheduler write."
+    ) from lost
 
 
 def _submit(client, solve, work, numbers):

@@ -29,6 +29,8 @@ class TiledRun:
         The settings as ``run.json`` shows them.
     inputs : list of dict
         Path, bytes and digest of each input file.
+    stamps : dict of str to (int, int)
+        Size and time of change of each, before its digest was taken.
     lost : list of Skipped
         Images that could not be registered, that touch nothing or cannot be read.
     digest : str
@@ -41,6 +43,7 @@ class TiledRun:
     settings: SfsSettings
     asked: dict
     inputs: list
+    stamps: dict
     lost: list
     digest: str
     version: str = __version__
