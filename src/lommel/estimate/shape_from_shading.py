@@ -31,7 +31,13 @@ from lommel.core.least_squares import (
     more_damping,
     stiffen,
 )
-from lommel.core.multigrid import NormalEquations, conjugate_gradients, dot, threads_for
+from lommel.core.multigrid import (
+    NormalEquations,
+    conjugate_gradients,
+    distance,
+    dot,
+    threads_for,
+)
 from lommel.core.normal_operator import prolong_add
 from lommel.core.plane import remove_plane
 from lommel.estimate.albedo_field import (
@@ -388,7 +394,7 @@ def _descend(level, u, steps, settings, history):
             damping = more_damping(damping)
             u, here = start, _look(level, start)
         else:  # no way down: stay
-            return start, _is_small(step, start, level, settings)
+            return start, _is_small(u + step, start, level, settings)
         level.albedo = here.albedo
         if not knows_shadows and gain < SETTLED * abs(cost):  # those of the start were its own
             level.see(u)
@@ -401,7 +407,7 @@ def _descend(level, u, steps, settings, history):
             {
                 "stride": level.stride,
                 "cost": cost,
-                "step_m": _rms(u - start),
+                "step_m": distance(u, start),
                 "cycles": linear.iterations,
                 "reduction": linear.reduction,
                 "damping": damping,
@@ -410,7 +416,7 @@ def _descend(level, u, steps, settings, history):
         # gains fall by a constant factor or faster, so the next one can be told
         next_gain, last_gain = gain * (min(gain / last_gain, 1.0) if last_gain else 1.0), gain
         is_done = next_gain < settings.gain_tolerance * abs(cost)
-        if damping == 0 and (is_done or _is_small(u - start, u, level, settings)):
+        if damping == 0 and (is_done or _is_small(u, start, level, settings)):
             return u, True
         is_near = damping == 0 and next_gain < NEAR * abs(cost)
         damping = less_damping(damping)
@@ -427,12 +433,8 @@ def _exposure_gain(here, level):
     return exposure_gain(here.sums, level.exposures, level.hazes, level.frees_albedo)
 
 
-def _is_small(step, u, level, settings):
-    return _rms(step) < settings.step_tolerance * _rms(u - level.initial)
-
-
-def _rms(change):
-    return float(np.sqrt(dot(change, change) / change.size))
+def _is_small(u, start, level, settings):
+    return distance(u, start) < settings.step_tolerance * distance(u, level.initial)
 
 
 def _best_cost(here, level, settings):

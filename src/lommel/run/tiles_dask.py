@@ -114,7 +114,7 @@ def _cluster(tiling):
         n_workers=tiling.workers,
         threads_per_worker=max(cores() // tiling.workers, 1),
         memory_limit=0,  # the size of the tiles keeps to the memory
-        dashboard_address=None,
+        dashboard_address=":0",  # any free port: several runs may go on at once
     )
 
 

@@ -15,10 +15,11 @@ from lommel.progress import silent, step
 from lommel.run.inputs import Skipped
 from lommel.run.records import read_array, read_record
 from lommel.run.shape_from_shading import cell_grid, write_exposures
-from lommel.run.tiles_plan import blend_weights
+from lommel.run.tiles_plan import BLEND, blend_weights
 from lommel.run.tiles_records import part_folder
 from lommel.run.tiles_settle import settle_tiles
 from lommel.run.tiles_solve import at_posts, stored_window
+from lommel.scene.grid import Window
 
 PRODUCTS = {  # description and unit, as of a scene in one piece
     "dem": ("height", "m"),
@@ -119,18 +120,49 @@ def _write_product(name, folder, grid, plan, work, correction):
 
 def _blended(name, window, plan, work):
     """A product in a window: the tiles that reach it, each with its share."""
+    out = np.empty(window.shape, np.float32)
+    for part in _pieces(window):
+        out[part.relative_to(window).slices] = _blended_piece(name, part, plan, work)
+    return out
+
+
+def _pieces(window):
+    """The middle of a tile, where it is alone, and what is around it."""
+    rim = BLEND // 2
+    if min(window.shape) <= 2 * rim:
+        return [window]
+    row, col, rows, cols = window.row, window.col, window.rows, window.cols
+    inner = rows - 2 * rim
+    return [
+        Window(row, col, rim, cols),
+        Window(row + rows - rim, col, rim, cols),
+        Window(row + rim, col, inner, rim),
+        Window(row + rim, col + cols - rim, inner, rim),
+        Window(row + rim, col + rim, inner, cols - 2 * rim),
+    ]
+
+
+def _blended_piece(name, window, plan, work):
+    reaching = [t for t in plan.tiles if not _common(t, window, plan).is_empty]
+    if len(reaching) == 1:
+        kept = stored_window(reaching[0], plan.shape)
+        part = part_folder(work, reaching[0].number)
+        return read_array(part, name)[window.relative_to(kept).slices]
     total, share = np.zeros(window.shape, np.float32), np.zeros(window.shape, np.float32)
-    for tile in plan.tiles:
+    for tile in reaching:
+        common = _common(tile, window, plan)
         kept = stored_window(tile, plan.shape)
-        common = window.intersection(kept)
-        if common.is_empty:
-            continue
         values = read_array(part_folder(work, tile.number), name)[common.relative_to(kept).slices]
         weights = np.where(np.isfinite(values), blend_weights(tile, common, plan.shape), 0)
         inside = common.relative_to(window).slices
         total[inside] += np.where(weights > 0, weights * values, 0)
         share[inside] += weights
     return np.where(share > 0, total / np.where(share > 0, share, 1), np.nan).astype(np.float32)
+
+
+def _common(tile, window, plan):
+    """What a tile knows of a window."""
+    return window.intersection(stored_window(tile, plan.shape))
 
 
 def _misfits(names, tiles):

@@ -31,6 +31,8 @@ from lommel.scene.grid import Window
 REACH = 12  # coarse posts beyond which a spline's coefficients feel less than 1e-6 of a value
 SAMPLE = 513  # posts along each side of the windows that tell priors and photometry
 SAMPLES = 3  # of them along each side of a larger scene
+# Where tiles start: closer than this the coarse surface still errs by what its area means leave
+START_GAIN, START_STEP = 1e-3, 0.005
 # The coarse surface errs by what area means and a coarse grid leave. Held more firmly the rim
 # passes that on: with 0.05 tiles differ from one piece twice as much as with 1 or 1000
 RIM_ERROR = 1.0  # times the change of height from post to post that the roughness stands for
@@ -123,7 +125,7 @@ def prepare_scene(footprints, stride, settings, progress=silent):
             scene.views,
             reflectance_model(settings.reflectance),
             coarse_priors(replace(priors, noise=noise), stride),
-            settings.solver,
+            replace(settings.solver, gain_tolerance=START_GAIN, step_tolerance=START_STEP),
             albedo,
             photometry,
         )
