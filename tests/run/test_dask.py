@@ -25,7 +25,7 @@ def test_a_cluster_of_its_own_gives_the_same_bytes(half_done, tile_scene, tiled)
 def test_the_tile_of_a_worker_that_is_killed_goes_to_another(half_done, tile_scene, tiled):
     killed = []
     with LocalCluster(
-        n_workers=2, threads_per_worker=2, memory_limit=0, dashboard_address=None
+        n_workers=2, threads_per_worker=2, memory_limit=0, dashboard_address=":0"
     ) as cluster:
 
         def progress(items, name, total=None, at_once=1):
