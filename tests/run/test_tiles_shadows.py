@@ -5,7 +5,7 @@ import numpy as np
 from lommel.io.raster import read_pixels, write_raster
 from lommel.run.inputs import SceneFiles
 from lommel.run.shape_from_shading import SfsSettings, run_shape_from_shading
-from lommel.run.tiles_plan import HALO, Tiling
+from lommel.run.tiles_plan import Tiling, halo
 from lommel.scene.body import MOON, local_frame, to_xyz
 from lommel.scene.grid import grid_from_bounds, read_crs
 from lommel.scene.masks import MaskSettings
@@ -47,6 +47,6 @@ def test_shadow_from_outside_a_tile_is_masked(tmp_path):
     known = np.isfinite(read_pixels(tmp_path / "out" / "measured.tif"))
     # of a tile that begins beyond the ridge, halo and all; the refined ridge is a little lower
     far = slice(3 * SIDE, 3 * SIDE + 24)
-    assert far.start - HALO > RIDGE + 48 and far.stop < reach - 48  # posts
+    assert far.start - halo(SIDE) > RIDGE + 48 and far.stop < reach - 48  # posts
     assert known[:, far].mean() < 0.05
     assert known[:, reach + 16 :].mean() > 0.95

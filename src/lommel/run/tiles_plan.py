@@ -20,7 +20,7 @@ BYTES_PER_POST, BYTES_PER_IMAGE = 200, 16  # measured: 211 with one image, 235 w
 AT_REST = 300e6  # bytes of a process with its modules and compiled code
 MEMORY_SHARE = 0.6  # of what is free now: a safe share, others work here as well
 ENGINES = ("serial", "processes", "dask")
-HALO = 256  # posts beside a tile that are solved along: under one Sun stripes go that far
+WIDEST_HALO = 256  # posts; under one Sun stripes carry what happens at a rim that far
 BLEND = 64  # posts over which a tile goes over into the next
 STEP = 128  # posts; tiles begin at multiples of it, so that coarse levels have the same posts
 LEAST_SIDE = 256  # posts; smaller tiles would be mostly halo
@@ -203,22 +203,34 @@ def _largest_side(shape, count, memory):
     for most_posts in range(widest, 0, -STEP):
         side = _even_side(shape, most_posts)
         most = max(count(tile.outer) for tile in _tiles(shape, side))
-        if _memory((side + 2 * HALO,) * 2, most) <= memory:
+        if _memory((side + 2 * halo(side),) * 2, most) <= memory:
             return side
     raise InputError(
         f"--memory {memory / 1e9:.2f} GB is too little for {most} images: a tile of {LEAST_SIDE} "
-        f"posts needs {_memory((LEAST_SIDE + 2 * HALO,) * 2, most) / 1e9:.2f} GB. Give more, or "
+        f"posts needs {_memory((3 * LEAST_SIDE,) * 2, most) / 1e9:.2f} GB. Give more, or "
         "fewer images."
     )
 
 
+def halo(side):
+    """Posts beside a tile that are solved along: not more than the tile itself has.
+
+    Parameters
+    ----------
+    side : int, posts
+        Of the tile.
+    """
+    return min(side, WIDEST_HALO)
+
+
 def _tiles(shape, side):
     rows, cols = shape
+    rim = halo(side)
     tiles: list[Tile] = []
     for row, last_row in _cuts(rows, side):
         for col, last_col in _cuts(cols, side):
             inner = Window(row, col, last_row - row, last_col - col)
-            around = Window(row - HALO, col - HALO, inner.rows + 2 * HALO, inner.cols + 2 * HALO)
+            around = Window(row - rim, col - rim, inner.rows + 2 * rim, inner.cols + 2 * rim)
             outer = around.intersection(Window(0, 0, rows, cols))
             tiles.append(Tile(len(tiles), inner, outer))
     return tiles
