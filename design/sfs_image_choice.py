@@ -30,7 +30,7 @@ from benchmarks.one import accuracy
 from lommel.estimate import image_choice
 from lommel.run.footprints import find_footprints
 from lommel.run.inputs import SceneFiles
-from lommel.run.selection import find_sights
+from lommel.run.selection import SKETCH, find_sights
 from lommel.run.shape_from_shading import SfsSettings, run_shape_from_shading
 
 COUNTS = (3, 4, 6, 8, 12, 24)
@@ -56,7 +56,7 @@ def main(folder):
 
 def order(files):
     """Images in the order in which they raise the log determinant most, over all places."""
-    footprints, ground, sights = find_sights(find_footprints(files), "lunar-lambert")
+    footprints, ground, sights = find_sights(find_footprints(files, sketch=SKETCH), "lunar-lambert")
     left = list(range(len(footprints.files.images)))
     known = np.zeros((ground.heights.size, 6))
     known[:, [0, 2]] = image_choice.SLOPE_ERROR**-2.0

@@ -124,7 +124,7 @@ def test_a_run_that_goes_on_does_not_look_at_the_images_again(many, tmp_path, mo
     assert prepare_array(files, output, settings, None, Tiling(side=128)) > 1
     before = survey(files, tmp_path / "elsewhere")
 
-    def refuse(*_):
+    def refuse(*_, **__):
         raise LommelError("looked at the images")
 
     monkeypatch.setattr(selection, "find_footprints", refuse)

@@ -75,6 +75,8 @@ class RasterInfo:
         An ISIS label, which may tell of a camera.
     grid : Grid or None
         None when the raster carries no CRS or no transform.
+    sketch : bool array (rows, cols) or None
+        True on pixels of a lattice that are known and not black, where that was asked for.
     """
 
     path: Path
@@ -85,6 +87,7 @@ class RasterInfo:
     has_mask_band: bool
     has_label: bool
     grid: Grid | None
+    sketch: np.ndarray | None = None
 
     @property
     def saturation(self):
@@ -92,7 +95,7 @@ class RasterInfo:
         return 255.0 if self.dtype == "uint8" else np.inf
 
 
-def raster_info(path, body=MOON):
+def raster_info(path, body=MOON, sketch=0):
     """Header of a raster, checked to be usable.
 
     Parameters
@@ -100,6 +103,9 @@ def raster_info(path, body=MOON):
     path : path
     body : Body
         The CRS, if any, must be one of this body.
+    sketch : int, pixels
+        Along each side of the lattice that tells where a map-projected raster shows something;
+        none is read for 0.
 
     Returns
     -------
@@ -116,6 +122,7 @@ def raster_info(path, body=MOON):
             )
         if file.dtypes[0].startswith("complex"):
             raise InputError(f"{path}: band 1 is {file.dtypes[0]}. Give a raster of real numbers.")
+        grid = _grid_of(file, path, body)
         return RasterInfo(
             path=Path(path),
             shape=(rows, cols),
@@ -124,8 +131,20 @@ def raster_info(path, body=MOON):
             nodata=file.nodata,
             has_mask_band=_has_mask_band(file),
             has_label=bool(file.tags(ns=ISIS_LABEL)),
-            grid=_grid_of(file, path, body),
+            grid=grid,
+            sketch=_sketch(file, path, sketch) if sketch and grid is not None else None,
         )
+
+
+def _sketch(file, path, size):
+    """Single pixels of a lattice: which of them are known and not black."""
+    shape = tuple(min(side, size) for side in file.shape)
+    try:
+        values = file.read(1, out_shape=shape, resampling=Resampling.nearest)
+        known = file.read_masks(1, out_shape=shape) > 0
+    except GDAL_ERRORS as error:
+        raise UnreadableError(f"{path} cannot be read, it may be truncated: {error}") from error
+    return known & (values > 0)
 
 
 def read_isis_label(path):
@@ -224,33 +243,6 @@ def read_pixels(path, window=None):
     return (
         values if (scale, offset) == (1.0, 0.0) else np.float32(scale) * values + np.float32(offset)
     )
-
-
-def read_sketch(path, size, body=MOON):
-    """Which part of a map-projected raster shows something: single pixels of a lattice.
-
-    Parameters
-    ----------
-    path : path
-    size : int, pixels
-        Along each side of the lattice at most.
-    body : Body
-
-    Returns
-    -------
-    grid : Grid
-        Of the raster.
-    shows : bool array (rows, cols)
-        True where the pixel is known and not black.
-    """
-    with _open(path) as file:
-        shape = tuple(min(side, size) for side in file.shape)
-        try:
-            values = file.read(1, out_shape=shape, resampling=Resampling.nearest)
-            known = file.read_masks(1, out_shape=shape) > 0
-        except GDAL_ERRORS as error:
-            raise UnreadableError(f"{path} cannot be read, it may be truncated: {error}") from error
-        return _grid_of(file, path, body), known & (values > 0)
 
 
 def read_image_on_grid(path, grid, body=MOON):

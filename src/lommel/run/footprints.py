@@ -57,6 +57,8 @@ class Footprints:
         What the choice adds to the results of the run.
     key : str
         Digest of what the footprints follow from.
+    looks : list of Look
+        What has been seen of the files; not kept with the rest.
     """
 
     files: SceneFiles
@@ -68,6 +70,7 @@ class Footprints:
     not_chosen: list[Skipped] = field(default_factory=list)
     results: dict[str, float] = field(default_factory=dict)
     key: str = ""
+    looks: list = field(default_factory=list)
 
     def uses(self, window):
         """Which images are used in a window, bool array (images,)."""
@@ -98,6 +101,7 @@ class Footprints:
             windows=self.windows[kept],
             is_used=self.is_used[kept],
             skipped=[*self.skipped, *skipped],
+            looks=[self.looks[k] for k in kept] if self.looks else [],
         )
 
     @property
@@ -117,8 +121,17 @@ class Footprints:
 
 
 @dataclass(frozen=True)
-class _Header:
-    """What a look at an image's files tells."""
+class Look:
+    """What a look at an image's files tells.
+
+    Attributes
+    ----------
+    path : Path
+    info : RasterInfo
+    camera_path : path or None
+        None for an orthoimage.
+    camera : Camera or None
+    """
 
     path: object
     info: RasterInfo
@@ -126,7 +139,7 @@ class _Header:
     camera: object = None
 
 
-def find_footprints(files, grid_settings=None, body=MOON):
+def find_footprints(files, grid_settings=None, body=MOON, sketch=0):
     """Footprints of images on the grid that follows from them and the DEM.
 
     Parameters
@@ -135,6 +148,8 @@ def find_footprints(files, grid_settings=None, body=MOON):
     grid_settings : GridSettings or Grid, optional
         A grid is taken as it is.
     body : Body
+    sketch : int, pixels
+        Of each orthoimage that are looked at along; see `raster_info`.
 
     Returns
     -------
@@ -145,7 +160,7 @@ def find_footprints(files, grid_settings=None, body=MOON):
         raise InputError("No DEM given. Name at least one with --dem.")
     settings = grid_settings or GridSettings()
     dem_grids = [read_grid(path, body) for path in files.dems]
-    headers, skipped = _read_headers(files, dem_grids, body)
+    headers, skipped = _read_headers(files, dem_grids, body, sketch)
     flat = [header.info.grid for header in headers if header.camera is None]
     cameras = [header.camera for header in headers if header.camera is not None]
     if not headers:
@@ -177,7 +192,8 @@ def find_footprints(files, grid_settings=None, body=MOON):
         cameras=tuple(header.camera_path for header in kept),
     )
     everywhere = np.ones((len(kept), 1, 1), bool)
-    return Footprints(files, grid, np.array(windows), skipped, max(grid.shape), everywhere)
+    side = max(grid.shape)
+    return Footprints(files, grid, np.array(windows), skipped, side, everywhere, looks=kept)
 
 
 def _some(files, kept):
@@ -205,26 +221,26 @@ def named_cameras(files):
     return files.cameras
 
 
-def _read_headers(files, dem_grids, body):
+def _read_headers(files, dem_grids, body, sketch):
     """Headers and cameras of the images that can be used, and the `Skipped` others."""
     named = named_cameras(files)
     cameras = dict(zip(files.images, named, strict=True)) if named else None
 
     def read(path):
         try:
-            info = raster_info(path, body)
+            info = raster_info(path, body, sketch)
             camera_path = cameras[path] if cameras else find_camera(path, info.has_label)
             if camera_path is not None:
-                return _Header(path, info, camera_path, read_camera(camera_path, info.shape))
+                return Look(path, info, camera_path, read_camera(camera_path, info.shape))
             grid = grid_of(info)
-            if all(dem.footprint(grid).is_empty for dem in dem_grids):
+            if all(grid.footprint(dem).is_empty for dem in dem_grids):
                 raise GeometryError(f"{path.name} does not overlap the DEM.")
-            return _Header(path, info)
+            return Look(path, info)
         except LommelError as error:
             return Skipped(path.name, str(error))
 
     found = side_by_side(read, files.images)
-    headers = [one for one in found if isinstance(one, _Header)]
+    headers = [one for one in found if isinstance(one, Look)]
     return headers, [one for one in found if isinstance(one, Skipped)]
 
 

@@ -16,9 +16,8 @@ import numpy as np
 from lommel.core.reflectance import reflectance_model
 from lommel.errors import InputError, LommelError
 from lommel.estimate.image_choice import Sights, choose_images, information
-from lommel.io.cameras import SUFFIXES, read_camera
+from lommel.io.cameras import SUFFIXES
 from lommel.io.positions import find_position
-from lommel.io.raster import raster_info, read_sketch, side_by_side
 from lommel.run.footprints import find_footprints, ground_sample_distance, terrain_grid
 from lommel.run.inputs import (
     GridSettings,
@@ -61,10 +60,11 @@ def survey_images(files, grid_settings, settings, output):
     earlier = _earlier(work_folder(output))
     if earlier is not None and earlier.key == key:
         return earlier
-    footprints = find_footprints(files, grid_settings)
-    if not settings.all_images:
+    chooses = len(files.images) > FEW and not settings.all_images
+    footprints = find_footprints(files, grid_settings, sketch=SKETCH if chooses else 0)
+    if chooses:
         footprints = select_images(footprints, settings.reflectance, settings.knows_albedo)
-    return replace(footprints, key=key)
+    return replace(footprints, key=key, looks=[])
 
 
 def _key(files, asked):
@@ -129,6 +129,7 @@ def find_sights(footprints, reflectance):
     Parameters
     ----------
     footprints : Footprints
+        With looks at the files, sketches of orthoimages among them.
     reflectance : str
         Name of a model.
 
@@ -143,12 +144,11 @@ def find_sights(footprints, reflectance):
     ground, model = _ground(footprints), reflectance_model(reflectance)
     tables = _tables(footprints.files, footprints.grid.body)
     told, skipped = {}, []
-    for k, look in enumerate(_looks(footprints.files, footprints.grid.body)):
-        path = footprints.files.images[k]
+    for k, look in enumerate(footprints.looks):
         try:
             told[k] = _tells(ground, footprints, k, look, tables, model)
         except LommelError as error:
-            skipped.append(Skipped(path.name, str(error)))
+            skipped.append(Skipped(look.path.name, str(error)))
     if not told:
         raise InputError("No image can be used.\n" + listing(skipped))
     footprints = footprints.only(list(told), skipped)
@@ -215,36 +215,19 @@ def _ground(footprints):
     return Ground(places, stride, heights, is_known, longitude, latitude, xyz, frame, slopes)
 
 
-def _looks(files, body):
-    """Camera of each image, or grid and sketch of an orthoimage, or what went wrong."""
-    cameras = dict(zip(files.images, files.cameras, strict=True))
-
-    def look(path):
-        try:
-            if cameras[path] is None:
-                return read_sketch(path, SKETCH, body)
-            return read_camera(cameras[path], raster_info(path, body).shape)
-        except LommelError as error:
-            return error
-
-    return side_by_side(look, files.images)
-
-
 def _tells(ground, footprints, k, look, tables, model):
     """The places that an image shows, and what it tells of each."""
-    if isinstance(look, LommelError):
-        raise look
-    files, grid, path = footprints.files, footprints.grid, footprints.files.images[k]
+    files, grid, path = footprints.files, footprints.grid, look.path
     posts = footprints.window(k)
     window = ground.window(posts)
     part = window.slices
-    if files.cameras[k] is None:
-        own, sketch = look
-        shows = _shows(own, sketch, ground.longitude[part], ground.latitude[part])
+    if look.camera is None:
+        own = look.info.grid
+        shows = _shows(own, look.info.sketch, ground.longitude[part], ground.latitude[part])
         gsd = (own.spacing[0] * own.spacing[1]) ** 0.5
         sun, position = (find_position(table, path.name, source) for source, table in tables)
     else:
-        camera = copy(look)  # which may keep tables of its lines, and they are large
+        camera = copy(look.camera)  # which may keep tables of its lines, and they are large
         shows = camera.contains(*camera.project(ground.xyz[part]))
         gsd = ground_sample_distance(camera, grid.cut(posts), float(np.mean(ground.heights[part])))
         sun, position = sun_of(camera, path, tables[0][1], files), camera.position

@@ -126,7 +126,7 @@ class Grid:
         """
         row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
         x, y = self.affine @ (col + 0.5, row + 0.5)
-        longitude, latitude = _to_geodetic(self.crs.to_wkt()).transform(x, y)
+        longitude, latitude = _to_geodetic(self._wkt).transform(x, y)
         return np.radians(longitude), np.radians(latitude)
 
     def index_at(self, longitude, latitude):
@@ -142,7 +142,7 @@ class Grid:
         """
         longitude = np.degrees(np.asarray(longitude, float))
         latitude = np.degrees(np.asarray(latitude, float))
-        transformer = _to_geodetic(self.crs.to_wkt())
+        transformer = _to_geodetic(self._wkt)
         x, y = transformer.transform(longitude, latitude, direction="INVERSE")
         reached = np.isfinite(x) & np.isfinite(y)
         col, row = ~self.affine @ (np.where(reached, x, np.nan), np.where(reached, y, np.nan))
@@ -178,13 +178,17 @@ class Grid:
         return self._outline
 
     @cached_property
+    def _wkt(self):
+        return self.crs.to_wkt()  # which pyproj puts together anew each time
+
+    @cached_property
     def _outline(self):
         rows, cols = self.shape
         share = np.linspace(0.0, 1.0, LATTICE)
         lattice = np.stack(self.lonlat_at(share[:, None] * rows - 0.5, share * cols - 0.5))
         points = [lattice.reshape(2, -1)]
-        for pole in (-np.pi / 2, np.pi / 2):
-            row, col = self.index_at(0.0, pole)
+        poles = np.array([-np.pi / 2, np.pi / 2])
+        for pole, row, col in zip(poles, *self.index_at(np.zeros(2), poles), strict=True):
             if abs(row - (rows - 1) / 2) <= rows / 2 and abs(col - (cols - 1) / 2) <= cols / 2:
                 longitude = np.linspace(-np.pi, np.pi, LATTICE)
                 points.append(np.stack([longitude, np.full(LATTICE, pole)]))
