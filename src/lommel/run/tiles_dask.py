@@ -14,7 +14,7 @@ import numba
 from distributed import Client, LocalCluster, WorkerPlugin, get_worker
 
 from lommel.errors import InputError, LommelError
-from lommel.run.tiles_plan import cores
+from lommel.run.machine import cores
 
 TILE = "lommel-tile"  # the resource of which a worker has one
 PATIENCE = "30s"  # until a scheduler must have answered

@@ -13,7 +13,7 @@ from multiprocessing import get_context
 
 from lommel.errors import InputError, LommelError
 from lommel.progress import silent
-from lommel.run.tiles_plan import cores
+from lommel.run.machine import cores
 
 
 def check_engine(tiling):
