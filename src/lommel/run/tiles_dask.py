@@ -11,7 +11,7 @@ from functools import partial
 from uuid import uuid4
 
 import numba
-from distributed import Client, LocalCluster, WorkerPlugin, get_worker
+from distributed import Client, LocalCluster, SchedulerPlugin, WorkerPlugin, get_worker
 
 from lommel.errors import InputError, LommelError
 from lommel.run.machine import cores
@@ -30,6 +30,20 @@ class OneTileAtATime(WorkerPlugin):
         await worker.set_resources(**{TILE: 1})
 
 
+class OneTileForNewcomers(SchedulerPlugin):
+    """Tells the scheduler the same of workers that join, before it looks for work for them.
+
+    What a worker declares itself comes after that, and parts that had no worker would stay without.
+    """
+
+    name = "lommel-one-tile-for-newcomers"
+    idempotent = True  # for several commands with one scheduler
+
+    def add_worker(self, scheduler, worker):
+        """Declare the resource, as Dask asks of a plugin."""
+        scheduler.add_resources(worker=worker, resources={TILE: 1})
+
+
 @contextmanager
 def connected(tiling):
     """A cluster to hand parts to.
@@ -46,6 +60,7 @@ def connected(tiling):
         scheduler is lost.
     """
     with _cluster(tiling) as cluster, _client(cluster) as client:
+        client.register_plugin(OneTileForNewcomers())
         client.register_plugin(OneTileAtATime())
         yield partial(_submit, client)
 
