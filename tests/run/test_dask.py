@@ -7,7 +7,7 @@ from threading import Timer
 import pytest
 from distributed import LocalCluster
 
-from lommel.errors import InputError
+from lommel.errors import InputError, LommelError
 from lommel.run import tiles_dask
 from lommel.run.shape_from_shading import run_shape_from_shading
 from lommel.run.tiles_plan import Tiling, work_folder
@@ -25,7 +25,7 @@ def test_a_cluster_of_its_own_gives_the_same_bytes(half_done, tile_scene, tiled)
 def test_the_tile_of_a_worker_that_is_killed_goes_to_another(half_done, tile_scene, tiled):
     killed = []
     with LocalCluster(
-        n_workers=2, threads_per_worker=2, memory_limit=0, dashboard_address=None
+        n_workers=2, threads_per_worker=2, memory_limit=0, dashboard_address=":0"
     ) as cluster:
 
         def progress(items, name, total=None, at_once=1):
@@ -44,7 +44,7 @@ def test_the_tile_of_a_worker_that_is_killed_goes_to_another(half_done, tile_sce
 def test_workers_that_come_when_tiles_wait_for_them_solve_them(half_done, tile_scene, tiled):
     """Jobs of a batch system start late; tiles handed out before waited for ever."""
     with LocalCluster(
-        n_workers=0, threads_per_worker=1, memory_limit=0, dashboard_address=None
+        n_workers=0, threads_per_worker=1, memory_limit=0, dashboard_address=":0"
     ) as cluster:
 
         def progress(items, name, total=None, at_once=1):
@@ -61,6 +61,29 @@ def test_workers_that_come_when_tiles_wait_for_them_solve_them(half_done, tile_s
             )
         finally:
             patience.cancel()
+    assert fingerprints(half_done) == fingerprints(tiled)
+
+
+def test_a_run_that_loses_its_scheduler_goes_on_with_another(half_done, tile_scene, tiled):
+    for is_lost in (True, False):
+        with LocalCluster(
+            n_workers=1, threads_per_worker=1, memory_limit=0, dashboard_address=":0"
+        ) as cluster:
+
+            def progress(items, name, total=None, at_once=1, cluster=cluster, is_lost=is_lost):
+                for done, item in enumerate(items):
+                    if name == "tiles" and done == 1 and is_lost:
+                        cluster.close()
+                    yield item
+
+            tiling = Tiling(engine="dask", side=SIDE, scheduler=cluster.scheduler_address)
+            request = files_of(tile_scene), half_done
+            if is_lost:
+                with pytest.raises(LommelError, match="with a scheduler that runs, goes on"):
+                    run_shape_from_shading(*request, tiling=tiling, progress=progress)
+                assert not half_done.exists()
+            else:
+                run_shape_from_shading(*request, tiling=tiling, progress=progress)
     assert fingerprints(half_done) == fingerprints(tiled)
 
 

@@ -109,7 +109,7 @@ def _cluster(tiling):
         n_workers=tiling.workers,
         threads_per_worker=max(cores() // tiling.workers, 1),
         memory_limit=0,  # the size of the tiles keeps to the memory
-        dashboard_address=None,
+        dashboard_address=":0",  # with None it asks for port 8787, and warns where that is taken
     )
 
 
