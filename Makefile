@@ -6,7 +6,7 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install test demo check docs bench
+.PHONY: help install test scale demo check docs bench
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s  %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -20,6 +20,9 @@ $(STAMP): pyproject.toml
 
 test: $(STAMP)  ## run the tests, and every example in docstrings, README and docs
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+scale: $(STAMP)  ## run the tests of large scenes and of SLURM: an hour or two, 8 GB, 40 GB of disk
+	$(BIN)/python -m pytest $(PYTEST_ARGS) -m scale
 
 demo: $(STAMP)  ## simulate an orbit strip, map and refine it, write demo/report.html
 	$(BIN)/lommel demo --output demo --overwrite

@@ -205,20 +205,42 @@ def main():
     report_exposures(output / "exposures.csv", truth)
 
 
-def report_exposures(path, truth):
-    """Print how far the exposures are off, along the strip and in groups that share ground."""
+def exposure_errors(path, truth):
+    """How far the exposures of a table are off, in their common unit.
+
+    Parameters
+    ----------
+    path : Path
+        The ``exposures.csv`` of a run.
+    truth : dict of str to float
+        Exposures of the frames by name, along the strip.
+
+    Returns
+    -------
+    error : array (images), of the logarithm
+        Of the images that are used, less its mean.
+    drift : float
+        How much it grows from one end of the strip to the other.
+    groups : array (images) of int
+        Images of a group share ground.
+    """
     with open(path, encoding="utf-8") as file:
         table = [row for row in csv.DictReader(file) if row["used"] == "1"]
     frame = {name: k for k, name in enumerate(truth)}
     place = np.array([frame[Path(row["image"]).stem] for row in table]) / max(len(truth) - 1, 1)
     ratio = [float(row["exposure"]) / truth[Path(row["image"]).stem] for row in table]
     error = np.log(ratio) - np.mean(np.log(ratio))
-    drift = np.polyfit(place, error, 1)[0] if len(error) > 1 else 0.0
+    drift = float(np.polyfit(place, error, 1)[0]) if len(error) > 1 else 0.0
+    return error, drift, np.array([int(row["group"]) for row in table])
+
+
+def report_exposures(path, truth):
+    """Print how far the exposures are off, along the strip and in groups that share ground."""
+    error, drift, groups = exposure_errors(path, truth)
     print(f"  exposures: {100 * error.std():.2f} % rms, drift {100 * drift:.2f} % along the strip")
-    groups = np.array([int(row["group"]) for row in table])
     apart = np.concatenate([error[groups == g] - error[groups == g].mean() for g in set(groups)])
     print(
-        f"  {len(truth) - len(table)} of {len(truth)} images left out; {len(set(groups))} groups, "
+        f"  {len(truth) - len(error)} of {len(truth)} images left out; {len(set(groups))} groups, "
         f"{100 * apart.std():.2f} % rms about the mean of each"
     )
 

@@ -28,7 +28,7 @@ FRAMES = 12
 def run(command, output, memory, workers):
     """Run a command on a cluster; seconds of the whole, of its stages, digests of the products."""
     command = [*command, "--memory", memory]
-    with LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster:
+    with LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=":0") as cluster:
         start = time.perf_counter()
         scheduler = ["--engine", "dask", "--dask-scheduler", cluster.scheduler_address]
         subprocess.run([*command, *scheduler], check=True, stdout=subprocess.DEVNULL)

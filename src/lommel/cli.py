@@ -354,7 +354,7 @@ def _solve_share(text, *request):
             done = f"The scene is prepared: {count} tiles for {share.count} jobs."
         else:
             count = solve_share(*request, share, progress)
-            done = f"The {count} tiles of share {share} are solved."
+            done = f"Share {share} is done: {count} tile{'' if count == 1 else 's'}."
     log.print(done, soft_wrap=True)
 
 

@@ -2,6 +2,7 @@
 
 import os
 import signal
+from threading import Timer
 
 import pytest
 from distributed import LocalCluster
@@ -38,6 +39,52 @@ def test_the_tile_of_a_worker_that_is_killed_goes_to_another(half_done, tile_sce
         tiling = Tiling(engine="dask", side=SIDE, scheduler=cluster.scheduler_address)
         run_shape_from_shading(files_of(tile_scene), half_done, tiling=tiling, progress=progress)
     assert killed
+    assert fingerprints(half_done) == fingerprints(tiled)
+
+
+def test_workers_that_come_when_tiles_wait_for_them_solve_them(half_done, tile_scene, tiled):
+    """Jobs of a batch system start late; tiles handed out before waited for ever."""
+    with LocalCluster(
+        n_workers=0, threads_per_worker=1, memory_limit=0, dashboard_address=":0"
+    ) as cluster:
+
+        def progress(items, name, total=None, at_once=1):
+            if name == "tiles":
+                cluster.scale(2)
+            return items
+
+        tiling = Tiling(engine="dask", side=SIDE, scheduler=cluster.scheduler_address)
+        patience = Timer(120, cluster.close)  # s; then the run ends and says why
+        patience.start()
+        try:
+            run_shape_from_shading(
+                files_of(tile_scene), half_done, tiling=tiling, progress=progress
+            )
+        finally:
+            patience.cancel()
+    assert fingerprints(half_done) == fingerprints(tiled)
+
+
+def test_a_run_that_loses_its_scheduler_goes_on_with_another(half_done, tile_scene, tiled):
+    for is_lost in (True, False):
+        with LocalCluster(
+            n_workers=1, threads_per_worker=1, memory_limit=0, dashboard_address=":0"
+        ) as cluster:
+
+            def progress(items, name, total=None, at_once=1, cluster=cluster, is_lost=is_lost):
+                for done, item in enumerate(items):
+                    if name == "tiles" and done == 1 and is_lost:
+                        cluster.close()
+                    yield item
+
+            tiling = Tiling(engine="dask", side=SIDE, scheduler=cluster.scheduler_address)
+            request = files_of(tile_scene), half_done
+            if is_lost:
+                with pytest.raises(LommelError, match="with a scheduler that runs, goes on"):
+                    run_shape_from_shading(*request, tiling=tiling, progress=progress)
+                assert not half_done.exists()
+            else:
+                run_shape_from_shading(*request, tiling=tiling, progress=progress)
     assert fingerprints(half_done) == fingerprints(tiled)
 
 

@@ -16,7 +16,8 @@ from lommel.estimate.albedo import WEIGHINGS
 from lommel.estimate.albedo_cells import cell_size
 from lommel.estimate.albedo_samples import block_edges
 from lommel.estimate.albedo_settings import check_settings
-from lommel.run.tiles_plan import MEMORY_SHARE, Tiling, free_memory
+from lommel.run.machine import free_memory
+from lommel.run.tiles_plan import MEMORY_SHARE, Tiling
 
 AT_REST = 560e6  # bytes of a process that reads images: its parts, GDAL's blocks, what is judged
 PER_IMAGE = 100e3  # bytes: its cells and its share of the sums

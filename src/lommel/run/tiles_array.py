@@ -119,8 +119,9 @@ def merge_tiles(output, overwrite=False, progress=silent):
     if missing:
         shown = ", ".join(map(str, missing[:10])) + (", ..." if len(missing) > 10 else "")
         raise LommelError(
-            f"{len(missing)} of {len(numbers)} tiles are not solved: {shown}. Tile n, from 0, is "
-            "of share n mod N + 1 of N; run the missing shares again, those done take no time."
+            f"{len(missing)} of {len(numbers)} tiles are not solved: {shown}. Run the shares "
+            "again, what is done takes no time; or the same command with --tiles 1/1, which "
+            "solves all that are missing."
         )
     record = RunRecord("sfs", dict(run.asked), list(run.inputs))
     with output_folder(output, overwrite, work) as folder:

@@ -11,10 +11,10 @@ from functools import partial
 from uuid import uuid4
 
 import numba
-from distributed import Client, LocalCluster, WorkerPlugin, get_worker
+from distributed import Client, LocalCluster, SchedulerPlugin, WorkerPlugin, get_worker
 
 from lommel.errors import InputError, LommelError
-from lommel.run.tiles_plan import cores
+from lommel.run.machine import cores
 
 TILE = "lommel-tile"  # the resource of which a worker has one
 PATIENCE = "30s"  # until a scheduler must have answered
@@ -29,6 +29,20 @@ class OneTileAtATime(WorkerPlugin):
     async def setup(self, worker):
         """Declare the resource, as Dask asks of a plugin."""
         await worker.set_resources(**{TILE: 1})
+
+
+class OneTileForNewcomers(SchedulerPlugin):
+    """Tells the scheduler the same of workers that join, before it looks for work for them.
+
+    What a worker declares itself comes after that, and parts that had no worker would stay without.
+    """
+
+    name = "lommel-one-tile-for-newcomers"
+    idempotent = True  # for several commands with one scheduler
+
+    def add_worker(self, scheduler, worker):
+        """Declare the resource, as Dask asks of a plugin."""
+        scheduler.add_resources(worker=worker, resources={TILE: 1})
 
 
 @contextmanager
@@ -47,6 +61,7 @@ def connected(tiling):
         scheduler is lost.
     """
     with _cluster(tiling) as cluster, _client(cluster) as client:
+        client.register_plugin(OneTileForNewcomers())
         register_one_tile(client)
         yield partial(_submit, client)
 
@@ -114,7 +129,7 @@ def _cluster(tiling):
         n_workers=tiling.workers,
         threads_per_worker=max(cores() // tiling.workers, 1),
         memory_limit=0,  # the size of the tiles keeps to the memory
-        dashboard_address=":0",  # any free port: several runs may go on at once
+        dashboard_address=":0",  # with None it asks for port 8787, and warns where that is taken
     )
 
 

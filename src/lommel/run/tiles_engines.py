@@ -16,7 +16,7 @@ from threading import Lock, Thread
 
 from lommel.errors import InputError, LommelError
 from lommel.progress import silent
-from lommel.run.tiles_plan import cores
+from lommel.run.machine import cores
 
 LOST = (
     "its worker is gone: ended by someone, or by the system for want of memory; with less --memory "

@@ -14,6 +14,7 @@ import numpy as np
 from affine import Affine
 
 from lommel.errors import InputError
+from lommel.run.machine import cores, free_memory
 from lommel.scene.grid import Grid, Window
 
 BYTES_PER_POST, BYTES_PER_IMAGE = 200, 16  # measured: 211 with one image, 235 with four
@@ -281,14 +282,6 @@ def earlier_cut(folder):
         return None, None
 
 
-def cores():
-    """Processor cores that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not every system tells
-        return os.cpu_count() or 1
-
-
 def _even_side(shape, most):
     """The least side that cuts the scene into no more tiles than the largest one does."""
     counts = [-(-size // most) for size in shape]
@@ -348,21 +341,6 @@ def read_memory(text):
     if not 0 < size < math.inf:
         raise InputError(f"memory = {text!r} is not a size. Give one like 8GB or 500MB.")
     return size
-
-
-def free_memory():
-    """Bytes that programs may take now, the system's and a control group's limit respected."""
-    sizes = [float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))]
-    try:
-        text = Path("/proc/meminfo").read_text(encoding="ascii")
-        sizes.append(float(text.split("MemAvailable:")[1].split()[0]) * 1024)
-    except (OSError, IndexError, ValueError):
-        pass
-    try:
-        sizes.append(float(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
-    except (OSError, ValueError):  # "max" is no number: no limit
-        pass
-    return min(sizes)
 
 
 def blend_weights(tile, window, shape, stride=1):
