@@ -12,14 +12,14 @@ from math import ceil, sqrt
 from lommel.estimate.albedo_settings import AlbedoSettings
 from lommel.run.albedo_plan import RAW_SECONDS, plan_albedo
 from lommel.run.mixed_scene import Place, PlacedScene
-from lommel.run.tiles_plan import HALO, Tiling, make_plan
+from lommel.run.tiles_plan import Tiling, halo, make_plan
 from lommel.scene.grid import Window, grid_from_bounds, read_crs
 
 FRAMES, SIDE, SPACING = 4010, 20_000, 10.0  # pixels and posts along a frame; m
 ROWS, COLS = 125_000, 545_000  # posts of the zone: 1250 km x 5450 km, 18 % of the Moon
 REGION = 20_000  # posts along a region that one run of `lommel sfs` solves
 CHOSEN = 8  # images of a place: of 24, 7 to 9 (docs/method.md, 3.6)
-IN_TILE = 12  # of a tile of 4,352 posts, as frames begin and end in it: 8 (1 + 4352 / 20000)²
+IN_TILE = 11  # of a tile of 3,968 posts, as frames begin and end in it: 8 (1 + 3968 / 20000)²
 MEMORY = 8e9  # bytes of a worker
 DISK_RATE = 200e6  # bytes per second of a shared disk, both ways
 MARGIN = 4  # for real cameras, a cold disk, failures
@@ -65,17 +65,17 @@ def _shading(posts, pixels, deep):
     regions = ceil(ROWS / REGION) * ceil(COLS / REGION)
     touching = round(FRAMES * (SIDE + REGION) ** 2 / posts)
     plan = make_plan((REGION, REGION), touching, MEMORY, count=lambda window: IN_TILE)
-    halo = plan.posts / REGION**2
+    twice = plan.posts / REGION**2
     whole, coarse = touching * SIDE**2, deep * REGION**2
     tiles = CHOSEN * plan.posts
     read = regions * (whole + coarse + tiles)
-    seconds = posts * (ONE_IMAGE + FURTHER * (CHOSEN - 1) * halo) + PREPARE * pixels
+    seconds = posts * (ONE_IMAGE + FURTHER * (CHOSEN - 1) * twice) + PREPARE * pixels
     side = sqrt(max(tile.outer.rows * tile.outer.cols for tile in plan.tiles))
-    per_post = f"{1e6 * ONE_IMAGE:.2f} + {CHOSEN - 1} × 0.25 × {halo:.2f}"
+    per_post = f"{1e6 * ONE_IMAGE:.2f} + {CHOSEN - 1} × 0.25 × {twice:.2f}"
     return [
         ("`sfs`: regions", f"of {REGION:,}² posts, {touching} images touch each", f"{regions}"),
         ("tiles of a region", f"of {side:,.0f}² posts, {IN_TILE} images", f"{len(plan.tiles)}"),
-        ("posts solved twice", f"halos of {HALO} posts", f"{100 * (halo - 1):.0f} %"),
+        ("posts solved twice", f"halos of {halo(plan.side)} posts", f"{100 * (twice - 1):.0f} %"),
         ("before them", "all images of a region at once", f"every {plan.stride}th post"),
         ("read for digests", f"{regions} × {touching} × {SIDE:,}²", _tb(regions * whole)),
         ("read for the coarse stage", f"{deep:.1f} images a post", _tb(regions * coarse)),
