@@ -4,8 +4,6 @@ Most callers want `run_shape_from_shading`.
 """
 
 import csv
-from collections import deque
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
@@ -31,7 +29,6 @@ from lommel.scene.grid import Grid
 from lommel.scene.masks import MaskSettings
 
 PARAMETRISATIONS = ("height", "ray")
-WRITERS = 2  # rasters written at a time: each needs twice its size in memory
 DOUBTFUL = 0.3  # correlation with the DEM's image below which an image is checked, for a second
 FADING = 10.0  # posts beyond the images' edge over which their say fades
 LEAST_POSTS = 33  # rows and columns: three octaves of wavelengths
@@ -263,14 +260,8 @@ def _write_products(folder, scene, initial, refined, surface, residual):
         "hillshade-before": lambda: (hillshade(grid, initial, view), cells, *shade),
         "hillshade-after": lambda: (hillshade(grid, refined, view), cells, *shade),
     }
-    waiting: deque[Future] = deque()
-    with ThreadPoolExecutor(WRITERS) as pool:  # GDAL compresses outside Python's lock
-        for name, product in products.items():
-            if len(waiting) == WRITERS:
-                waiting.popleft().result()
-            waiting.append(pool.submit(write_raster, folder / f"{name}.tif", *product()))
-        for writing in waiting:
-            writing.result()
+    for name, product in products.items():  # not in threads, see `tiles_products`
+        write_raster(folder / f"{name}.tif", *product())
 
 
 def _modelled_where_measured(surface):

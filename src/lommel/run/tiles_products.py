@@ -4,7 +4,6 @@ Most callers want `finish_products`.
 """
 
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from types import SimpleNamespace
 
@@ -32,7 +31,6 @@ PRODUCTS = {  # description and unit, as of a scene in one piece
     "hillshade-before": ("cosine of incidence", "1"),
     "hillshade-after": ("cosine of incidence", "1"),
 }
-AT_ONCE = 2  # products: compressing one, and shrinking it for overviews, keeps a core busy
 MEASURED = ("dem", "residual")  # their root mean squares are results
 ON_POSTS = ("dem", "initial-dem")  # the others live on the cells between posts
 
@@ -86,14 +84,15 @@ def finish_products(run, work, folder, record, known, progress=silent):
 
 
 def _write_products(folder, grid, plan, work, correction, progress):
-    """Blend the tiles into rasters, several at a time; root mean squares for the results."""
+    """Blend the tiles into rasters; root mean squares for the results.
 
-    def write(name):
-        return _write_product(name, folder, grid, plan, work, correction)
-
-    with ThreadPoolExecutor(AT_ONCE) as threads:
-        values = progress(threads.map(write, PRODUCTS), "products", len(PRODUCTS), AT_ONCE)
-        return dict(zip(PRODUCTS, values, strict=True))
+    One after the other: of two that were written side by side in threads, one in some hundred had
+    blocks without data.
+    """
+    return {
+        name: _write_product(name, folder, grid, plan, work, correction)
+        for name in progress(list(PRODUCTS), "products")
+    }
 
 
 def _write_product(name, folder, grid, plan, work, correction):
@@ -105,7 +104,7 @@ def _write_product(name, folder, grid, plan, work, correction):
             if window.is_empty:
                 continue
             values = _blended(name, window, plan, work)
-            if name == "dem":  # the only one that calls compiled loops: two threads must not
+            if name == "dem":
                 values += at_posts(correction, plan.stride, window)
             write(values, window)
             if name == "dem":
