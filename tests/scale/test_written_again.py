@@ -1,4 +1,4 @@
-"""Products are written by two threads at once, and none may lose a part of it."""
+"""Products are the same however often they are written: two threads at once once lost parts."""
 
 import shutil
 from hashlib import sha256
@@ -12,7 +12,7 @@ from lommel.run.shares import Share
 from lommel.run.tiles_array import merge_tiles, prepare_array, solve_share
 from lommel.run.tiles_plan import Tiling, work_folder
 
-TIMES = 60  # on a busy machine 1 of 10 was damaged before writers took turns
+TIMES = 60  # on a busy machine 1 of 10 was damaged while two threads wrote at once
 
 
 @pytest.mark.scale

@@ -14,7 +14,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from threading import Lock
 
 import numpy as np
 import rasterio
@@ -51,9 +50,6 @@ SCRATCH_ROWS = 128  # of these tiles while they are written: rows of all of them
 CACHE_MB = 128  # of blocks that GDAL holds; its default is a share of the machine
 ISIS_LABEL = "json:ISIS3"  # GDAL's domain of metadata that holds it
 FILES_AT_ONCE = 8  # whose headers are read side by side: a shared disk answers after milliseconds
-# GDAL 3.10 loses windows now and then when two threads write at once, though to files of their own:
-# one product in a hundred on a busy machine, none of 1,600 since they take turns
-WRITING = Lock()
 MARGIN = 4  # pixels read around a window so that interpolation sees its neighbours
 
 if "GDAL_CACHEMAX" not in os.environ:
@@ -464,9 +460,7 @@ def raster_writer(path, grid, description, unit="", dtype=np.float32, nodata=np.
 
             def write(values, window):
                 part = FileWindow(window.col, window.row, window.cols, window.rows)
-                values = np.asarray(values, dtype)
-                with WRITING:
-                    file.write(values, 1, window=part)
+                file.write(np.asarray(values, dtype), 1, window=part)
 
             yield write
         with rasterio.open(scratch) as file:

@@ -86,8 +86,8 @@ def finish_products(run, work, folder, record, known, progress=silent):
 def _write_products(folder, grid, plan, work, correction, progress):
     """Blend the tiles into rasters; root mean squares for the results.
 
-    One after the other: of two that were written side by side in threads, one in some hundred had
-    blocks without data.
+    One after the other: of two that threads write at once, though to files of their own, GDAL 3.10
+    leaves blocks of one in a hundred without data when the machine is busy.
     """
     return {
         name: _write_product(name, folder, grid, plan, work, correction)
