@@ -28,10 +28,12 @@ def remove_plane(values):
             total += np.float64(row[c])
             tilt += (c - middle) * np.float64(row[c])
         sums[i], tilts[i] = total, tilt
-    mean, along, across = sums.sum() / (rows * cols), 0.0, 0.0
+    mean, along, across = 0.0, 0.0, 0.0
     for i in range(rows):
+        mean += sums[i]
         across += (i - 0.5 * (rows - 1)) * sums[i]
         along += tilts[i]
+    mean /= rows * cols
     along /= max(rows * (cols * (cols * cols - 1.0)) / 12.0, 1.0)
     across /= max(cols * (rows * (rows * rows - 1.0)) / 12.0, 1.0)
     for i in prange(rows):
