@@ -347,42 +347,6 @@ def distance(a, b):
         return float(np.sqrt(_block_squares(a, b).sum() / a.size))
 
 
-def add_pull(u, target, weights, out):
-    """Add the pull of posts to where they are held to a gradient.
-
-    Parameters
-    ----------
-    u, target : float32 array (rows, cols)
-    weights : float32 array (rows, cols)
-    out : float32 array (rows, cols)
-        Gets ``weights (u - target)`` added.
-
-    Returns
-    -------
-    energy : float
-        The sum of ``weights (u - target)^2``.
-    """
-    with threads_for(u.shape):
-        return float(_add_pull(u, target, weights, out).sum())
-
-
-@njit(cache=True, parallel=True, fastmath={"contract", "reassoc", "nsz"})
-def _add_pull(u, target, weights, out):
-    rows = u.shape[0]
-    sums = np.zeros((rows + BLOCK - 1) // BLOCK)
-    for i in prange(sums.size):
-        first = np.int64(i) * BLOCK
-        total = 0.0
-        for r in range(first, min(first + BLOCK, rows)):
-            a, b, w, o = u[r], target[r], weights[r], out[r]
-            for c in range(a.size):
-                off = a[c] - b[c]
-                o[c] += w[c] * off
-                total += np.float64(w[c] * off) * np.float64(off)
-        sums[i] = total
-    return sums
-
-
 @njit(cache=True, parallel=True, fastmath={"contract", "reassoc", "nsz"})
 def _block_squares(a, b):
     rows = a.shape[0]

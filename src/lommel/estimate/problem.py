@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lommel.core.multigrid import add_long_waves, add_pull, coarse_masses, dot, threads_for
+from lommel.core.multigrid import add_long_waves, coarse_masses, dot, threads_for
 from lommel.core.normal_operator import (
     apply_operator,
     coarse_shape,
@@ -326,7 +326,10 @@ class Problem:
         cost = dot(change, out) / 2
         cost += add_long_waves(change, self.masses, out) / 2
         if self.pins is not None:
-            cost += add_pull(u, self.pinned, self.pins, out) / 2
+            np.subtract(u, self.pinned, out=change)
+            pull = self.pins * change
+            out += pull
+            cost += dot(change, pull) / 2
         return out, cost
 
     def slide_along_views(self, step, u):
