@@ -4,21 +4,24 @@ Most callers want `finish_products`.
 """
 
 from collections import Counter
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 
 from lommel.io.raster import raster_writer
 from lommel.progress import silent, step
+from lommel.run.apart import call_apart
 from lommel.run.inputs import Skipped
+from lommel.run.machine import cores
 from lommel.run.records import read_array, read_record
 from lommel.run.shape_from_shading import cell_grid, write_exposures
-from lommel.run.tiles_plan import BLEND, blend_weights
+from lommel.run.tiles_plan import AT_REST, BLEND, Plan, blend_weights
 from lommel.run.tiles_records import part_folder
 from lommel.run.tiles_settle import settle_tiles
 from lommel.run.tiles_solve import at_posts, stored_window
-from lommel.scene.grid import Window
+from lommel.scene.grid import Grid, Window
 
 PRODUCTS = {  # description and unit, as of a scene in one piece
     "dem": ("height", "m"),
@@ -33,6 +36,9 @@ PRODUCTS = {  # description and unit, as of a scene in one piece
 }
 MEASURED = ("dem", "residual")  # their root mean squares are results
 ON_POSTS = ("dem", "initial-dem")  # the others live on the cells between posts
+WORTH_PROCESSES = 3e7  # posts; what a process takes to start is then little against its work
+WRITING = 200e6  # bytes that GDAL takes in a process that writes
+HELD = 8  # floats of a window that is written, and of its squares
 
 
 def size_on_disk(tile, shape):
@@ -86,26 +92,55 @@ def finish_products(run, work, folder, record, known, progress=silent):
 def _write_products(folder, grid, plan, work, correction, progress):
     """Blend the tiles into rasters; root mean squares for the results.
 
-    One after the other: of two that threads write at once, though to files of their own, GDAL 3.10
-    leaves blocks of one in a hundred without data when the machine is busy.
+    In processes where that is worth their start, not in threads: of two files that threads write at
+    once GDAL 3.10 leaves blocks of one in a hundred without data when the machine is busy.
     """
-    return {
-        name: _write_product(name, folder, grid, plan, work, correction)
-        for name in progress(list(PRODUCTS), "products")
-    }
+    jobs = [
+        _Writing(name, folder, grid, plan, work, correction if name == "dem" else None)
+        for name in PRODUCTS
+    ]
+    workers = _writers(plan)
+    if workers == 1:
+        sums = [_write_product(job) for job in progress(jobs, "products")]
+    else:
+        rasters = call_apart(_write_product, jobs, workers)
+        sums = list(progress(rasters, "products", len(jobs), workers))
+    return dict(zip(PRODUCTS, sums, strict=True))
 
 
-def _write_product(name, folder, grid, plan, work, correction):
+def _writers(plan):
+    """Processes that write products: as many as the cores, and what a tile takes, have room for."""
+    if plan.shape[0] * plan.shape[1] < WORTH_PROCESSES:
+        return 1
+    rows, cols = plan.tiles[0].inner.shape
+    each = AT_REST + WRITING + HELD * np.dtype(np.float32).itemsize * rows * cols
+    return int(np.clip((plan.memory - AT_REST) // each, 1, cores()))
+
+
+@dataclass(frozen=True)
+class _Writing:
+    """What it takes to write one product."""
+
+    name: str
+    folder: Path
+    grid: Grid
+    plan: Plan
+    work: Path
+    correction: np.ndarray | None  # of heights, on coarse posts
+
+
+def _write_product(job):
     """Blend one product window by window; its root mean square where that is asked for."""
+    name, grid, plan, work = job.name, job.grid, job.plan, job.work
     frame, count, total = grid if name in ON_POSTS else cell_grid(grid), 0, 0.0
-    with raster_writer(folder / f"{name}.tif", frame, *PRODUCTS[name]) as write:
+    with raster_writer(job.folder / f"{name}.tif", frame, *PRODUCTS[name]) as write:
         for tile in plan.tiles:
             window = tile.inner.intersection(frame.window)
             if window.is_empty:
                 continue
             values = _blended(name, window, plan, work)
-            if name == "dem":
-                values += at_posts(correction, plan.stride, window)
+            if job.correction is not None:
+                values += at_posts(job.correction, plan.stride, window)
             write(values, window)
             if name == "dem":
                 values -= _blended("initial-dem", window, plan, work)

@@ -1,0 +1,76 @@
+"""Functions called in processes of their own."""
+
+import math
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from lommel.errors import InputError, LommelError
+from lommel.run.apart import call_apart
+from lommel.run.tiles_plan import read_memory
+
+SLEEPING = """
+import time
+from lommel.run.apart import call_apart
+list(call_apart(time.sleep, [60], 1))
+"""
+
+
+def test_results_come_in_the_order_of_the_arguments():
+    assert list(call_apart(math.sqrt, [1, 4, 9], 2)) == [1, 2, 3]
+
+
+def test_what_a_function_prints_is_no_result(capfd):
+    assert list(call_apart(print, ["ink"], 1)) == [None]
+    assert "ink" in capfd.readouterr().err
+
+
+def test_what_a_function_raises_is_raised_here():
+    with pytest.raises(ValueError, match="domain"):
+        list(call_apart(math.sqrt, [1, -1], 2))
+    with pytest.raises(InputError, match="'much' is not a size"):
+        list(call_apart(read_memory, ["much"], 1))
+
+
+def test_a_process_that_is_lost_is_told_and_the_others_end():
+    start = time.monotonic()
+    results = call_apart(eval, ["__import__('os')._exit(3)", "__import__('time').sleep(60)"], 2)
+    with pytest.raises(LommelError, match="status 3"):
+        list(results)
+    assert time.monotonic() - start < 30  # s, of the 60 that the other one was to sleep
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+def test_processes_end_with_the_one_that_waits_for_them():
+    waiting = subprocess.Popen([sys.executable, "-c", SLEEPING])
+    try:
+        assert _within(30, lambda: _children(waiting.pid))
+        child = _children(waiting.pid)[0]
+        waiting.send_signal(signal.SIGKILL)
+        waiting.wait()
+        assert _within(10, lambda: not Path(f"/proc/{child}").exists())
+    finally:
+        waiting.kill()
+
+
+def _children(process):
+    """Of all its threads."""
+    try:
+        threads = Path(f"/proc/{process}/task").iterdir()
+        return [child for t in threads for child in (t / "children").read_text().split()]
+    except OSError:
+        return []
+
+
+def _within(seconds, holds):
+    """Whether something comes true in time."""
+    end = time.monotonic() + seconds
+    while not holds():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.05)
+    return True
