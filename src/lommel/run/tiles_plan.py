@@ -21,7 +21,8 @@ BYTES_PER_POST, BYTES_PER_IMAGE = 200, 16  # measured: 211 with one image, 235 w
 AT_REST = 300e6  # bytes of a process with its modules and compiled code
 MEMORY_SHARE = 0.6  # of what is free now: a safe share, others work here as well
 ENGINES = ("serial", "processes", "dask")
-WIDEST_HALO = 256  # posts; under one Sun stripes carry what happens at a rim that far
+WIDE_HALO, NARROW_HALO = 256, 128  # posts; under one Sun stripes carry far what happens at a rim
+WIDE_TILE = 2048  # posts; of tiles as wide, rims are so small a part that the narrow halo does
 BLEND = 64  # posts over which a tile goes over into the next
 STEP = 128  # posts; tiles begin at multiples of it, so that coarse levels have the same posts
 LEAST_SIDE = 256  # posts; smaller tiles would be mostly halo
@@ -214,14 +215,14 @@ def _largest_side(shape, count, memory):
 
 
 def halo(side):
-    """Posts beside a tile that are solved along: not more than the tile itself has.
+    """Posts beside a tile that are solved along: not more than the tile has, fewer where it is large.
 
     Parameters
     ----------
     side : int, posts
         Of the tile.
     """
-    return min(side, WIDEST_HALO)
+    return min(side, WIDE_HALO) if side < WIDE_TILE else NARROW_HALO
 
 
 def _tiles(shape, side):
