@@ -19,15 +19,15 @@ FRAMES, SIDE, SPACING = 4010, 20_000, 10.0  # pixels and posts along a frame; m
 ROWS, COLS = 125_000, 545_000  # posts of the zone: 1250 km x 5450 km, 18 % of the Moon
 REGION = 20_000  # posts along a region that one run of `lommel sfs` solves
 CHOSEN = 8  # images of a place: of 24, 7 to 9 (docs/method.md, 3.6)
-IN_TILE = 11  # of a tile of 3,968 posts, as frames begin and end in it: 8 (1 + 3968 / 20000)²
+IN_TILE = 12  # of a tile of 4,352 posts, as frames begin and end in it: 8 (1 + 4352 / 20000)²
 MEMORY = 8e9  # bytes of a worker
 DISK_RATE = 200e6  # bytes per second of a shared disk, both ways
 MARGIN = 4  # for real cameras, a cold disk, failures
 WEEK = 7 * 86_400.0
 
-# Core-seconds. Of 850 s on two busy cores for 4e8 posts and an image of 4.3e8 pixels, 81 prepared
-ONE_IMAGE = 2 * (850 - 81) / 4e8  # per post, to solve with one image and write
-PREPARE = 2 * 81 / 4.3e8  # per pixel: digest, samples, coarse stage; at most, it has the DEM in it
+# Core-seconds. Of 789 s on two cores for 4e8 posts and an image of 4.3e8 pixels, 63 prepared
+ONE_IMAGE = 2 * (789 - 63) / 4e8  # per post, to solve with one image and write
+PREPARE = 2 * 63 / 4.3e8  # per pixel: digest, samples, coarse stage; at most, it has the DEM in it
 FURTHER = 0.25e-6  # per post of a tile and further image
 ALBEDO = 2 * 429 / 1e9  # per pixel of 40 orthoimages of 5000 x 5000, all of the command
 ANEW = 1.25  # workers compute samples in every pass
