@@ -1,6 +1,7 @@
 """Functions called in processes of their own."""
 
 import math
+import os
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from lommel.errors import InputError, LommelError
+from lommel.run import apart
 from lommel.run.apart import call_apart
 from lommel.run.tiles_plan import read_memory
 
@@ -22,6 +24,11 @@ list(call_apart(time.sleep, [60], 1))
 
 def test_results_come_in_the_order_of_the_arguments():
     assert list(call_apart(math.sqrt, [1, 4, 9], 2)) == [1, 2, 3]
+
+
+def test_processes_share_the_cores(monkeypatch):
+    monkeypatch.setattr(apart, "cores", lambda: 6)
+    assert list(call_apart(os.getenv, ["NUMBA_NUM_THREADS"], 2)) == ["3"]
 
 
 def test_what_a_function_prints_is_no_result(capfd):

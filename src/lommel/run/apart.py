@@ -11,9 +11,10 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from threading import Thread
+from threading import Event, Thread
 
 from lommel.errors import LommelError
+from lommel.run.machine import cores
 
 CHILD = "from lommel.run.apart import answer; answer()"
 
@@ -21,7 +22,8 @@ CHILD = "from lommel.run.apart import answer; answer()"
 def call_apart(function, arguments, workers):
     """Results of a function for one argument after the other; several are worked on at a time.
 
-    The processes end with this one, and with the iterator that gives their results.
+    The processes share the cores, and end with this one and with the iterator that gives their
+    results.
 
     Parameters
     ----------
@@ -41,24 +43,33 @@ def call_apart(function, arguments, workers):
         When a process ends without a result; what the function raises is raised as it is.
     """
     alive: set[subprocess.Popen] = set()
+    ended = Event()
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+        "NUMBA_NUM_THREADS": str(max(cores() // workers, 1)),
+    }
     threads = ThreadPoolExecutor(workers)  # each waits for a process
     try:
-        waiting = [threads.submit(_ask, function, one, alive) for one in arguments]
+        waiting = [
+            threads.submit(_ask, function, one, environment, alive, ended) for one in arguments
+        ]
         for future in waiting:
             yield future.result()
     finally:
+        ended.set()
         threads.shutdown(wait=False, cancel_futures=True)
         for process in list(alive):
             process.kill()
         threads.shutdown()
 
 
-def _ask(function, argument, alive):
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+def _ask(function, argument, environment, alive, ended):
     command = [sys.executable, "-c", CHILD]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment) as process:
         alive.add(process)
+        if ended.is_set():  # while it was started
+            process.kill()
         try:
             with suppress(BrokenPipeError):  # it has ended, as is told below
                 pickle.dump((function, argument), process.stdin)
