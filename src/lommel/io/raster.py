@@ -19,6 +19,7 @@ import numpy as np
 import rasterio
 import rasterio.shutil
 from affine import Affine
+from numba import get_num_threads
 from rasterio._env import set_gdal_config
 from rasterio._err import CPLE_BaseError
 from rasterio.enums import ColorInterp, Resampling
@@ -285,7 +286,8 @@ def read_on_grid(path, grid, body=MOON, interpolation=Resampling.cubic, unknown=
     values : float32 array (rows, cols), NaN where the raster has nothing
     """
     source = read_grid(path, body)
-    part = _needed_part(source, grid)
+    place = grid.place_in(source)
+    part = _needed_part(source, grid) if place is None else place
     if part.is_empty:
         return np.full(grid.shape, np.nan, np.float32)
     is_large = part.rows * part.cols > max(PIXELS_AT_ONCE, 4 * grid.shape[0] * grid.shape[1])
@@ -296,7 +298,7 @@ def read_on_grid(path, grid, body=MOON, interpolation=Resampling.cubic, unknown=
         return np.concatenate([read_on_grid(path, h, body, interpolation, unknown) for h in halves])
     values, source = read_pixels(path, part), source.cut(part)
     values[np.isin(values, unknown)] = np.nan
-    if source.is_same(grid):
+    if place is not None or source.is_same(grid):
         return values
     return resample(values, source, grid, interpolation)
 
@@ -324,6 +326,7 @@ def resample(values, source, grid, interpolation=Resampling.cubic):
         "dst_crs": grid.crs.to_wkt(),
         "src_nodata": np.nan,
         "dst_nodata": np.nan,
+        "num_threads": get_num_threads(),
         "tolerance": 0.0,  # exact transform at every post: the default errs by 1/8 pixel
     }
     if not is_finer:  # else GDAL blurs what lies at the seam of a global raster

@@ -8,12 +8,14 @@ import copy
 import hashlib
 import os
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 
 from lommel.errors import GeometryError, InputError, LommelError
 from lommel.io.cameras import find_camera, read_camera
 from lommel.io.raster import RasterInfo, grid_of, raster_info, read_grid, side_by_side
+from lommel.run.apart import call_apart
 from lommel.run.inputs import (
     DEM_IS_FINE_ENOUGH,
     GridSettings,
@@ -25,12 +27,14 @@ from lommel.run.inputs import (
     refuse_duplicates,
     refuse_unusable,
 )
+from lommel.run.machine import cores
 from lommel.run.tiles_plan import coarse_grid
-from lommel.scene.body import MOON, to_lonlat
+from lommel.scene.body import MOON, Body, to_lonlat
 from lommel.scene.grid import Grid, Window, bounds_in, grid_from_bounds, read_crs
 from lommel.scene.intersection import meet_sphere
 
 SIGHTS = 17  # pixels along each side of an image whose rays tell its footprint
+PER_PROCESS = 250  # images that are worth a process of their own, which takes a second to start
 COARSE = 64  # posts along the longer side of the terrain that tells between which heights it lies
 
 
@@ -223,25 +227,56 @@ def named_cameras(files):
 
 def _read_headers(files, dem_grids, body, sketch):
     """Headers and cameras of the images that can be used, and the `Skipped` others."""
-    named = named_cameras(files)
-    cameras = dict(zip(files.images, named, strict=True)) if named else None
+    named, images = named_cameras(files), files.images
+    look = LookAt(dict(zip(images, named, strict=True)) if named else None, dem_grids, body, sketch)
+    workers = min(cores(), len(images) // PER_PROCESS)
+    if workers < 2:
+        found = look(images)
+    else:  # opening a file holds all threads of a process up
+        ends = [len(images) * k // workers for k in range(workers + 1)]
+        shares = [images[first:last] for first, last in pairwise(ends)]
+        found = [one for some in call_apart(look, shares, workers) for one in some]
+    headers = [one for one in found if isinstance(one, Look)]
+    return headers, [one for one in found if isinstance(one, Skipped)]
 
-    def read(path):
+
+@dataclass(frozen=True)
+class LookAt:
+    """Looks at the files of images.
+
+    Attributes
+    ----------
+    cameras : dict of path to path or None, or None
+        Camera file of each image; those found beside the images where this is None.
+    dem_grids : list of Grid
+    body : Body
+    sketch : int, pixels
+        As of `find_footprints`.
+    """
+
+    cameras: dict | None
+    dem_grids: list[Grid]
+    body: Body
+    sketch: int
+
+    def __call__(self, images):
+        """`Look` of each image, or `Skipped` where it cannot be used."""
+        return side_by_side(self._look, images)
+
+    def _look(self, path):
         try:
-            info = raster_info(path, body, sketch)
-            camera_path = cameras[path] if cameras else find_camera(path, info.has_label)
+            info = raster_info(path, self.body, self.sketch)
+            camera_path = (
+                find_camera(path, info.has_label) if self.cameras is None else self.cameras[path]
+            )
             if camera_path is not None:
                 return Look(path, info, camera_path, read_camera(camera_path, info.shape))
             grid = grid_of(info)
-            if all(grid.footprint(dem).is_empty for dem in dem_grids):
+            if all(grid.footprint(dem).is_empty for dem in self.dem_grids):
                 raise GeometryError(f"{path.name} does not overlap the DEM.")
             return Look(path, info)
         except LommelError as error:
             return Skipped(path.name, str(error))
-
-    found = side_by_side(read, files.images)
-    headers = [one for one in found if isinstance(one, Look)]
-    return headers, [one for one in found if isinstance(one, Skipped)]
 
 
 def terrain_grid(grid, places):

@@ -19,7 +19,7 @@ from lommel.scene.geometry import Observation
 from lommel.scene.grid import Grid, Window, bounds_in, grid_from_bounds, read_crs
 
 POST_LIMIT = 2**30  # posts of the products: 4 GiB for every float32 array of them
-POSTS_AT_ONCE = 2**24  # of the terrain while it is read, 30 bytes each
+SQUARE = 4096  # posts along each side of the terrain while it is read, 30 bytes each
 RADIUS_FROM = 0.5  # of the body's radius; no height comes near it
 DEM_IS_FINE_ENOUGH = 1.5  # image pixels per DEM post up to which the DEM's own grid is kept
 
@@ -158,8 +158,9 @@ def choose_grid(image_grids, dem_grids, settings, prefer="images", body=MOON):
     """The grid of the products.
 
     Automatic: the area that images and DEM share, in the CRS of the preferred input, at the
-    images' own spacing. With ``prefer='dem'`` the DEM's posts are kept as they are, unless the
-    images are finer than the DEM by more than `DEM_IS_FINE_ENOUGH`.
+    images' own spacing, and at their own posts where these coincide. With ``prefer='dem'`` the
+    DEM's posts are kept as they are, unless the images are finer than the DEM by more than
+    `DEM_IS_FINE_ENOUGH`.
 
     Parameters
     ----------
@@ -189,10 +190,24 @@ def choose_grid(image_grids, dem_grids, settings, prefer="images", body=MOON):
         spacing = dem_spacing if keeps_dem else gsd
     if settings.bounds is not None:
         return grid_from_bounds(settings.bounds, spacing, crs, body)
-    bounds = np.array([bounds_in(grid, crs) for grid in image_grids])
-    union = *bounds[:, :2].min(axis=0).tolist(), *bounds[:, 2:].max(axis=0).tolist()
-    own = grid_from_bounds(union, spacing, crs, body)
+    is_theirs = settings.is_automatic and crs == image_grids[0].crs
+    own = _common_lattice(image_grids) if is_theirs else None
+    if own is None:
+        bounds = np.array([bounds_in(grid, crs) for grid in image_grids])
+        union = *bounds[:, :2].min(axis=0).tolist(), *bounds[:, 2:].max(axis=0).tolist()
+        own = grid_from_bounds(union, spacing, crs, body)
     return own.cut(_enclosing([dem.footprint(own) for dem in dem_grids]))
+
+
+def _common_lattice(grids):
+    """The grid around all of them whose posts are theirs; None where theirs do not coincide."""
+    offsets = [grid.offset_in(grids[0]) for grid in grids]
+    if None in offsets:
+        return None
+    first = np.array(offsets)
+    last = first + [grid.shape for grid in grids]
+    low = first.min(axis=0)
+    return grids[0].cut(Window(*low.tolist(), *(last.max(axis=0) - low).tolist()))
 
 
 def read_heights(paths, grid, body=MOON):
@@ -232,10 +247,8 @@ def known_heights(paths, grid, body=MOON):
     -------
     heights : float32 array (rows, cols), m; NaN where no DEM knows
     """
-    rows = max(1, POSTS_AT_ONCE // grid.shape[1])
     heights = np.empty(grid.shape, np.float32)
-    for first in range(0, grid.shape[0], rows):
-        part = Window(first, 0, min(rows, grid.shape[0] - first), grid.shape[1])
+    for part in grid.window.parts(SQUARE, SQUARE):
         heights[part.slices] = _mean_heights(paths, grid.cut(part), body)
     return heights
 

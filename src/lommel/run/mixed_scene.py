@@ -37,8 +37,8 @@ from lommel.scene.body import MOON
 from lommel.scene.geometry import Observation
 from lommel.scene.grid import Grid, Window
 
-POSTS_AT_ONCE = 2**21  # of terrain or of an orthoimage while it is read
-BANDS_TOGETHER = 8  # of terrain that another process reads at a time
+BAND = 512  # rows read together: tiles of GeoTIFFs are as high, and each is unpacked once or twice
+POSTS_AT_ONCE = 2**24  # of terrain or of an orthoimage while it is read, at most
 SQUARE = 768  # posts along each side of the parts of a raw image, 500 bytes each
 
 
@@ -180,12 +180,8 @@ def read_placed(placed, jobs=None, store=Held.rows, stamps=None):
     jobs, stamps = jobs or InThreads(), stamps or {}
     common = replace(placed, places=[], skipped=[])  # a job needs no place but its own
     grid, skipped = placed.grid, list(placed.skipped)
-    parts = list(bands(grid.window, max(1, POSTS_AT_ONCE // grid.shape[1])))
-    numbered = list(enumerate(parts))
-    found = jobs.each(
-        ReadTerrain(common, store, stamps), numbered, "terrain", BANDS_TOGETHER, threads=1
-    )
-    found = list(found)
+    numbered = list(enumerate(_bands(grid.window)))
+    found = list(jobs.each(ReadTerrain(common, store, stamps), numbered, "terrain", threads=1))
     if not any(is_known for _, is_known in found):
         raise InputError(
             "The DEM has no height inside the output grid. Check --bounds, and that DEM and "
@@ -193,9 +189,8 @@ def read_placed(placed, jobs=None, store=Held.rows, stamps=None):
         )
     heights = stacked([rows for rows, _ in found])
     numbered = list(enumerate(placed.places))
-    images = list(
-        jobs.each(ReadImage(common, store, heights, stamps), numbered, "images", threads=1)
-    )
+    read = ReadImage(common, store, heights, stamps)
+    images = list(jobs.each(read, numbered, "images", threads=1))
     skipped += [image for image in images if isinstance(image, Skipped)]
     observations = [image for image in images if not isinstance(image, Skipped)]
     if not observations:
@@ -223,7 +218,7 @@ class ReadTerrain:
         """Heights of a band and whether any is known, from its number and its window."""
         number, part = item
         rows = self.store(f"heights-{number:05d}", part.shape, self._heights(part))
-        return rows, bool(np.isfinite(rows[:]).any())
+        return rows, any(np.isfinite(row).any() for row in rows)
 
     def _heights(self, part):
         yield self.placed.terrain.heights(self.placed.grid.cut(part))
@@ -267,10 +262,9 @@ class ReadImage:
         refuse_changed(self.stamps, [place.path])
 
 
-def bands(window, rows):
-    """Parts of a window of so many rows at most, all columns each, from north to south."""
-    for first in range(0, window.rows, rows):
-        yield replace(window, row=window.row + first, rows=min(rows, window.rows - first))
+def _bands(window):
+    """All columns of some rows each, from north to south."""
+    return window.parts(max(1, min(BAND, POSTS_AT_ONCE // window.cols)))
 
 
 def _circumstances(place, placed):
@@ -289,8 +283,8 @@ def _checked_rows(place, placed, heights):
     has_value = has_ground = False
     for part, values in read(place, placed):
         is_known = np.isfinite(values)
-        has_value |= bool(is_known.any())
-        has_ground |= bool((is_known & np.isfinite(heights[part.slices])).any())
+        has_value = has_value or bool(is_known.any())
+        has_ground = has_ground or bool((is_known & np.isfinite(heights[part.slices])).any())
         yield values
     name = place.path.name
     if not has_value and place.raw is None:
@@ -300,7 +294,7 @@ def _checked_rows(place, placed, heights):
 
 
 def _flat_rows(place, placed):
-    for part in bands(place.window, max(1, POSTS_AT_ONCE // place.window.cols)):
+    for part in _bands(place.window):
         yield part, read_image_on_grid(place.path, placed.grid.cut(part), placed.terrain.body)
 
 

@@ -61,13 +61,14 @@ class Rows:
 
     def __getitem__(self, index):
         """Some rows, or some columns of them, read anew."""
-        rows, *cols = index if isinstance(index, tuple) else (index,)
+        rows, cols = index if isinstance(index, tuple) else (index, slice(None))
         if not isinstance(rows, slice):
-            return self[(slice(rows, rows + 1), *cols)][0]
+            return self[slice(rows, rows + 1), cols][0]
         first, last, _ = rows.indices(len(self))
-        return self._read(first, max(first, last))[(slice(None), *cols)]
+        return self._read(first, max(first, last), cols)
 
-    def _read(self, first, last):
+    def _read(self, first, last, cols):
+        """Rows from first to before last, and of them the columns of a slice."""
         raise NotImplementedError
 
 
@@ -84,16 +85,29 @@ class StoredRows(Rows):
     path: Path
     shape: tuple[int, int]
 
-    def _read(self, first, last):
-        size, width = last - first, self.shape[1]
+    def _read(self, first, last, cols):
+        width = self.shape[1]
+        low, high, _ = cols.indices(width)
+        values = np.empty((last - first, max(high - low, 0)), np.float32)
         try:
-            values = np.fromfile(self.path, np.float32, size * width, offset=4 * first * width)
-            return values.reshape(size, width)
+            with open(self.path, "rb", buffering=0) as file:
+                if values.shape[1] == width:
+                    self._fill(file, first * width, values)
+                else:
+                    for row, part in enumerate(values, first):
+                        self._fill(file, row * width + low, part)
+            return values
         except (OSError, ValueError) as error:  # missing, or shorter
             raise LommelError(
                 f"{self.path} is damaged ({error}). The same command makes it anew; of a job "
                 "array that with --tiles 0/N, before the shares."
             ) from error
+
+    @staticmethod
+    def _fill(file, place, values):
+        file.seek(4 * place)
+        if values.size and file.readinto(values.view(np.uint8).data) != values.nbytes:
+            raise ValueError("it is too short")
 
 
 @dataclass(frozen=True)
@@ -112,12 +126,14 @@ class StackedRows(Rows):
         """Rows of all bands, and columns."""
         return sum(len(band) for band in self.bands), self.bands[0].shape[1]
 
-    def _read(self, first, last):
+    def _read(self, first, last, cols):
         parts, top = [], 0
         for band in self.bands:
-            parts.append(band[max(first - top, 0) : max(last - top, 0)])
+            low, high = max(first - top, 0), min(last - top, len(band))
+            if low < high or not parts:
+                parts.append(band[low : max(low, high), cols])
             top += len(band)
-        return np.concatenate(parts)
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def stacked(bands):

@@ -61,6 +61,14 @@ class Window:
         cols = min(self.col + self.cols, other.col + other.cols) - col
         return Window(row, col, max(rows, 0), max(cols, 0))
 
+    def parts(self, rows, cols=None):
+        """Windows of so many rows and columns at most, from north to south, all columns if None."""
+        cols = cols or self.cols
+        for row in range(0, self.rows, rows):
+            for col in range(0, self.cols, cols):
+                size = min(rows, self.rows - row), min(cols, self.cols - col)
+                yield Window(self.row + row, self.col + col, *size)
+
     def relative_to(self, other):
         """The same posts, counted from the first post of ``other``."""
         return replace(self, row=self.row - other.row, col=self.col - other.col)
@@ -196,6 +204,9 @@ class Grid:
 
     def footprint(self, other):
         """The window of ``other`` that this grid's area touches; empty when apart."""
+        place = self.place_in(other)
+        if place is not None:
+            return place
         there = np.stack(other.index_at(*self.outline()))
         there = there[:, np.isfinite(there).all(axis=0)]
         if there.size == 0:
@@ -204,6 +215,31 @@ class Grid:
         first = np.floor(there.min(axis=1) + 0.5 + SAME_POST).astype(int)
         size = np.ceil(there.max(axis=1) - 0.5 - SAME_POST).astype(int) - first + 1
         return Window(*first.tolist(), *size.tolist()).intersection(other.window)
+
+    def offset_in(self, other):
+        """Row and column of ``other`` at which the first post stands, when all stand at its posts.
+
+        Told by the CRS as it is written and by the affine maps, without a projection.
+
+        Returns
+        -------
+        offset : (row, col) of int, or None
+            Also beside ``other``; None where posts of both do not coincide.
+        """
+        if self._wkt != other._wkt:
+            return None
+        rows, cols = self.shape
+        ends = np.array([0.5, cols - 0.5, 0.5]), np.array([0.5, 0.5, rows - 0.5])  # three corners
+        col, row = ~other.affine @ (self.affine @ ends)
+        first = round(row[0] - 0.5), round(col[0] - 0.5)
+        away = row - 0.5 - first[0] - [0, 0, rows - 1], col - 0.5 - first[1] - [0, cols - 1, 0]
+        return first if np.abs(away).max() < SAME_POST else None
+
+    def place_in(self, other):
+        """The window of ``other`` that has the same posts as this grid; None where none has."""
+        offset = self.offset_in(other)
+        window = None if offset is None else Window(*offset, *self.shape)
+        return window if window and window.intersection(other.window) == window else None
 
     def is_same(self, other):
         """True when both grids have their posts at the same places."""
