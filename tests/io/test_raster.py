@@ -157,6 +157,13 @@ def test_smooth_terrain_is_the_same_on_any_grid(tmp_path, crs):
     assert np.abs(error).max() < 0.01  # m, cubic interpolation of 300 m waves of 60 degrees
 
 
+def test_posts_of_the_file_are_read_as_they_are(tmp_path):
+    values = np.random.default_rng(1).normal(size=GRID.shape).astype("f4")
+    values[12:14, 20] = np.nan
+    path, window = write_plain(tmp_path / "a.tif", values), Window(7, 11, 20, 13)
+    np.testing.assert_array_equal(read_on_grid(path, GRID.cut(window)), values[window.slices])
+
+
 def test_finer_input_is_averaged(tmp_path):
     fine = Grid((240, 320), Affine(125, 0, 0, 0, -125, 30e3), CYLINDRICAL)
     values = np.random.default_rng(2).normal(size=fine.shape).astype("f4")

@@ -8,6 +8,7 @@ import pytest
 from affine import Affine
 
 from lommel.errors import InputError
+from lommel.run import footprints
 from lommel.run.footprints import Footprints, camera_window, find_footprints
 from lommel.run.inputs import SceneFiles
 from lommel.run.views import read_views
@@ -102,6 +103,20 @@ def test_broken_files_are_named_and_the_others_are_found(tile_scene, tmp_path):
     reasons = {skip.name: skip.reason for skip in found.skipped}
     assert "cannot be opened as a raster" in reasons["junk.tif"]
     assert "there is no such file" in reasons["lost.tif"]
+
+
+def test_many_images_are_looked_at_by_several_processes(tile_scene, tmp_path, monkeypatch):
+    junk = tmp_path / "junk.tif"
+    junk.write_bytes(b"no raster")
+    files = files_of(tile_scene)
+    files = replace(files, images=(files.images[0], junk, *files.images[1:]))
+    alone = find_footprints(files, sketch=8)
+    monkeypatch.setattr(footprints, "PER_PROCESS", 1)
+    monkeypatch.setattr(footprints, "cores", lambda: 2)
+    shared = find_footprints(files, sketch=8)
+    assert shared.files == alone.files and shared.skipped == alone.skipped
+    np.testing.assert_array_equal(shared.windows, alone.windows)
+    assert [look.info.shape for look in shared.looks] == [look.info.shape for look in alone.looks]
 
 
 def test_no_image_at_all_is_refused_with_every_reason(tile_scene, tmp_path):

@@ -89,6 +89,17 @@ def test_posts_of_a_single_image_are_kept():
     assert (row, col) == pytest.approx((round(float(row)), round(float(col))), abs=1e-6)
 
 
+def test_posts_that_images_have_in_common_are_kept():
+    """Far from the equator of this map a post is not as wide as it is high."""
+    crs = read_crs("+proj=eqc +lat_ts=40 +R=1737400 +units=m +type=crs")
+    mosaic = grid_from_bounds((0.0, 0.0, 60e3, 50e3), 100.0, crs)
+    images = [mosaic.cut(Window(60, 200, 90, 80)), mosaic.cut(Window(20, 70, 100, 150))]
+    grid = choose_grid(images, [mosaic], GridSettings())
+    assert grid.is_same(mosaic.cut(Window(20, 70, 130, 210)))
+    moved = replace(images[1], affine=images[1].affine @ Affine.translation(0.5, 0))
+    assert choose_grid([images[0], moved], [mosaic], GridSettings()).offset_in(mosaic) is None
+
+
 def test_spacing_is_the_median_of_the_images():
     grids = [grid_from_bounds(IMAGE.bounds, spacing, CYLINDRICAL) for spacing in (80, 100, 400)]
     grid = choose_grid(grids, [DEM], GridSettings())

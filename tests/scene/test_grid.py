@@ -1,5 +1,7 @@
 """Grids: places of posts, windows, footprints, and the CRSs they accept."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from affine import Affine
@@ -112,6 +114,33 @@ def test_footprint_holds_the_posts_whose_pixels_are_touched():
     grid = GRIDS["cylindrical"]
     small = grid_from_bounds((30_600.0, 60_100.0, 31_400.0, 60_900.0), 100.0, CYLINDRICAL)
     assert small.footprint(grid) == Window(18, 1, 2, 2)
+
+
+@pytest.mark.parametrize("name", GRIDS)
+def test_a_part_of_a_grid_knows_its_place_there(name):
+    grid = GRIDS[name]
+    part = grid.cut(Window(3, 5, 20, 11))
+    assert part.place_in(grid) == Window(3, 5, 20, 11)
+    assert grid.offset_in(part) == (-3, -5)
+    assert grid.place_in(part) is None  # it reaches beyond
+
+
+def test_posts_that_do_not_coincide_have_no_place():
+    grid = GRIDS["cylindrical"]
+    moved = replace(grid, affine=grid.affine @ Affine.translation(0.3, 0))
+    wider = replace(grid, affine=grid.affine @ Affine.scale(1.001))  # 0.06 posts at the far end
+    turned = replace(grid, affine=grid.affine @ Affine.rotation(0.1))
+    elsewhere = replace(grid, crs=GEOGRAPHIC)
+    assert {g.offset_in(grid) for g in (moved, wider, turned, elsewhere)} == {None}
+
+
+def test_parts_of_a_window_cover_it_once():
+    window = Window(2, 3, 10, 7)
+    seen = np.zeros((15, 12), int)
+    for part in window.parts(4, 3):
+        seen[part.slices] += 1
+    assert seen[window.slices].min() == 1 and seen.sum() == 70
+    assert [part.shape for part in window.parts(6)] == [(6, 7), (4, 7)]
 
 
 def test_footprint_of_a_grid_elsewhere_is_empty():
