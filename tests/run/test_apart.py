@@ -12,7 +12,7 @@ import pytest
 
 from lommel.errors import InputError, LommelError
 from lommel.run import apart
-from lommel.run.apart import call_apart
+from lommel.run.apart import ProcessLost, Workers, call_apart
 from lommel.run.tiles_plan import read_memory
 
 SLEEPING = """
@@ -49,6 +49,24 @@ def test_a_process_that_is_lost_is_told_and_the_others_end():
     with pytest.raises(LommelError, match="status 3"):
         list(results)
     assert time.monotonic() - start < 30  # s, of the 60 that the other one was to sleep
+
+
+def test_a_process_answers_again_and_one_that_is_lost_is_replaced():
+    with Workers(1) as workers:
+        first, again = (workers.submit(os.getpid) for _ in range(2))
+        assert first.result() == again.result() != os.getpid()
+        with pytest.raises(ProcessLost, match="status -9"):
+            workers.submit(os.kill, first.result(), signal.SIGKILL).result()
+        assert workers.submit(os.getpid).result() not in (first.result(), os.getpid())
+
+
+def test_what_cannot_be_sent_is_raised_and_the_process_goes_on():
+    with Workers(1) as workers:
+        with pytest.raises(Exception, match="pickle"):
+            workers.submit(math.sqrt, lambda: 4).result()
+        with pytest.raises(Exception, match="pickle"):
+            workers.submit(eval, "lambda: 4").result()
+        assert workers.submit(math.sqrt, 4).result() == 2
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")

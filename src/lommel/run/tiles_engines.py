@@ -4,19 +4,12 @@ Jobs are a path and a number; arrays stay on the disk that all workers see. Most
 `solve_all`.
 """
 
-import os
-import signal
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
 from functools import partial
-from multiprocessing import Pipe, get_context
-from queue import SimpleQueue
-from threading import Lock, Thread
 
 from lommel.errors import InputError, LommelError
 from lommel.progress import silent
-from lommel.run.machine import cores
+from lommel.run.apart import ProcessLost, Workers
 
 LOST = (
     "its worker is gone: ended by someone, or by the system for want of memory; with less --memory "
@@ -95,8 +88,8 @@ def open_engine(tiling):
     if tiling.engine == "serial":
         yield _serial
     elif tiling.engine == "processes":
-        with _Processes(tiling.workers) as processes:
-            yield processes.start
+        with Workers(tiling.workers) as workers:
+            yield _processes(workers)
     else:
         with _dask_module().connected(tiling) as start:
             yield start
@@ -106,78 +99,19 @@ def _serial(solve, work, numbers):
     return [partial(solve, work, number) for number in numbers], 1
 
 
-class _Processes:
-    """Workers of their own, who share the cores among them; one that dies takes only its part.
+def _processes(workers):
+    def start(solve, work, numbers):
+        futures = [workers.submit(solve, work, number) for number in numbers]
+        return [partial(_result, future) for future in futures], workers.count
 
-    Each holds the end of a pipe whose other end this process has alone. When that is closed, by a
-    run that is broken off or by the system because this process is gone, workers end at once.
-    """
-
-    def __init__(self, workers):
-        self.workers, self.starting = workers, Lock()
-        self.end_of_pipe, self.pipe = Pipe(duplex=False)
-        self.threads = ThreadPoolExecutor(workers)  # each waits for a worker
-        self.idle: SimpleQueue[ProcessPoolExecutor] = SimpleQueue()
-        for _ in range(workers):
-            self.idle.put(self._new_worker())
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, error, *_):
-        self.threads.shutdown(wait=False, cancel_futures=True)
-        if error is not None:
-            self.pipe.close()
-        self.threads.shutdown()
-        for _ in range(self.workers):
-            self.idle.get().shutdown()
-        self.pipe.close()
-        self.end_of_pipe.close()
-
-    def start(self, solve, work, numbers):
-        """As of `open_engine`; workers that are lost are replaced."""
-        futures = [self.threads.submit(self._solve, solve, work, number) for number in numbers]
-        return [future.result for future in futures], self.workers
-
-    def _new_worker(self):
-        context = get_context("spawn")
-        return ProcessPoolExecutor(1, context, _watch, (self.end_of_pipe,))
-
-    def _solve(self, *job):
-        worker = self.idle.get()
-        try:
-            with self.starting:
-                future = self._submit(worker, job)
-            return future.result()
-        except BrokenProcessPool:
-            worker = self._new_worker()
-            return LOST
-        finally:
-            self.idle.put(worker)
-
-    def _submit(self, worker, job):
-        """A worker begins here, and takes the number of its threads from the environment."""
-        before = os.environ.get("NUMBA_NUM_THREADS")
-        os.environ["NUMBA_NUM_THREADS"] = str(max(cores() // self.workers, 1))
-        try:
-            return worker.submit(*job)
-        finally:
-            if before is None:
-                del os.environ["NUMBA_NUM_THREADS"]
-            else:
-                os.environ["NUMBA_NUM_THREADS"] = before
+    return start
 
 
-def _watch(pipe):
-    """Let this worker end with the process that has the other end of a pipe."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other one is told too, and tells
-
-    def end():
-        with suppress(EOFError):
-            pipe.recv()
-        os._exit(1)
-
-    Thread(target=end, daemon=True).start()
+def _result(future):
+    try:
+        return future.result()
+    except ProcessLost:
+        return LOST
 
 
 def _dask_module():
