@@ -79,9 +79,10 @@ Registers = Annotated[
     bool, typer.Option("--register", help="Register raw images to the DEM first.")
 ]
 Engine = Annotated[
-    str,
+    str | None,
     typer.Option(
-        help="Parts of a large run one after the other (serial), in processes, or by dask."
+        help="Parts of a large run one after the other (serial), in processes, or by dask. "
+        "Default: serial, but tiles in processes where that is quicker."
     ),
 ]
 Scheduler = Annotated[
@@ -148,7 +149,7 @@ def albedo(
             "Default: 60 % of what is free."
         ),
     ] = None,
-    engine: Engine = "serial",
+    engine: Engine = None,
     dask_scheduler: Scheduler = None,
     tiles: Annotated[
         str | None,
@@ -283,7 +284,7 @@ def sfs(
             "Default: 60 % of what is free."
         ),
     ] = None,
-    engine: Engine = "serial",
+    engine: Engine = None,
     dask_scheduler: Scheduler = None,
     tiles: Annotated[
         str | None,

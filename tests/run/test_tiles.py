@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from lommel.cli import app
 from lommel.errors import InputError, LommelError
 from lommel.io import raster
 from lommel.io.raster import read_grid, read_on_grid, read_pixels
-from lommel.run import tiles, tiles_products
+from lommel.run import tiles, tiles_plan, tiles_products
 from lommel.run.records import digest_of, is_done, read_record, save_part
 from lommel.run.shape_from_shading import run_shape_from_shading
 from lommel.run.tiles_plan import (
@@ -22,6 +23,7 @@ from lommel.run.tiles_plan import (
     coarse_grid,
     halo,
     make_plan,
+    plan_tiles,
     read_memory,
     work_folder,
 )
@@ -59,6 +61,39 @@ def test_a_plan_stays_within_memory(memory):
     assert plan.side < 20_000 / len(plan.tiles) ** 0.5 + STEP  # all of them about as large
     assert plan.shape[0] * plan.shape[1] / plan.stride**2 * 250 < memory
     assert not make_plan((500, 500), 3, memory).is_tiled
+
+
+def footprints_of(shape, images=1):
+    """Images that all touch everything."""
+    return SimpleNamespace(
+        grid=SimpleNamespace(shape=shape),
+        used=SimpleNamespace(images=[None] * images),
+        uses=lambda window: np.ones(images, bool),
+    )
+
+
+@pytest.mark.parametrize(
+    ("size", "memory", "workers"), [(20_000, 8e9, 2), (20_000, 64e9, 2), (4000, 1e9, 1)]
+)
+def test_tiles_go_to_processes_where_these_have_room_for_large_ones(
+    size, memory, workers, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(tiles_plan, "cores", lambda: 2)
+    plan = plan_tiles(footprints_of((size, size)), Tiling(memory), tmp_path / "out")
+    assert plan.workers == workers
+    assert plan.memory <= memory
+    assert Tiling(memory).settled(plan).workers == workers
+    alone = plan_tiles(footprints_of((size, size)), Tiling(memory, "serial"), tmp_path / "out")
+    assert (alone.workers, alone.stride) == (1, plan.stride)  # one process solves that at any rate
+
+
+def test_the_tiles_of_an_earlier_run_are_not_too_much_for_processes(monkeypatch, tmp_path):
+    """A tile of 5,120 posts needs 6.5 GB."""
+    monkeypatch.setattr(tiles_plan, "cores", lambda: 2)
+    monkeypatch.setattr(tiles_plan, "earlier_cut", lambda folder: (5120, 4))
+    monkeypatch.setattr(tiles_plan, "free_memory", lambda: 8e9 / tiles_plan.MEMORY_SHARE)
+    plan = plan_tiles(footprints_of((20_000, 20_000)), Tiling(), tmp_path / "out")
+    assert (plan.side, plan.workers) == (5120, 1)
 
 
 def test_too_little_memory_is_refused_with_what_is_needed():

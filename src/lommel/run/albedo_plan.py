@@ -137,7 +137,7 @@ def plan_albedo(placed, settings, tiling=None, is_shared=False):
     plan : AlbedoPlan
     """
     tiling = tiling or Tiling()
-    is_shared, workers = is_shared or tiling.engine != "serial", tiling.workers
+    is_shared, workers = is_shared or not tiling.is_alone, tiling.workers
     check_settings(settings)
     windows = [place.window for place in placed.places]
     windows = np.array([(w.row, w.col, w.rows, w.cols) for w in windows], np.int64).reshape(-1, 4)

@@ -88,7 +88,7 @@ def run_tiles(
         clear_partial(work)
         prepare(run, work, progress)
     with record.stage("tiles"):
-        solve_tiles(work, run.plan.tiles, tiling, progress)
+        solve_tiles(work, run.plan.tiles, tiling.settled(run.plan), progress)
     write_products(run, work, folder, record, progress)
     return record.results
 
@@ -143,9 +143,7 @@ def describe_run(files, footprints, lost, output, settings, grid_settings, tilin
         record.inputs,
         before,
         [*lost, *footprints.skipped],
-        digest_of(
-            [record.settings, record.inputs, asdict(plan) | {"memory": None}, footprints.choice]
-        ),
+        digest_of([record.settings, record.inputs, plan.cut, footprints.choice]),
     )
 
 

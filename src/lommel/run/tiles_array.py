@@ -4,7 +4,7 @@ One job prepares the scene, any number of jobs solve a share of its tiles each, 
 blends them into products. Most callers want `prepare_array`, `solve_share` and `merge_tiles`.
 """
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from lommel.errors import InputError, LommelError
@@ -39,6 +39,7 @@ def prepare_array(files, output, settings, grid_settings, tiling, progress=silen
     tiles : int
     """
     refuse_registration(settings.registers)
+    tiling = replace(tiling, engine=tiling.engine or "serial")  # each share plans for itself alone
     with only_run(output):
         with step(progress, "footprints"):
             footprints = survey_images(files, grid_settings, settings, output)

@@ -85,7 +85,7 @@ def open_engine(tiling):
     start : function (solve, work, numbers)
         Gives functions without arguments that wait for one result each, and the number of workers.
     """
-    if tiling.engine == "serial":
+    if tiling.is_alone:
         yield _serial
     elif tiling.engine == "processes":
         with Workers(tiling.workers) as workers:
