@@ -35,15 +35,16 @@ from lommel.estimate.albedo_equations import (
     connected_groups,
     noise_scale,
     standard_errors,
-    visit,
     visitor_of,
 )
+from lommel.estimate.albedo_kernels import accumulate
 from lommel.estimate.albedo_maps import MapMaker, MapRows, WholeMaps, disagreement_of
 from lommel.estimate.albedo_samples import SampleBlocks, overlapping_pairs
 from lommel.estimate.albedo_settings import AlbedoSettings, check_settings
 from lommel.estimate.albedo_solver import solve, weighting
 
-WEIGHINGS = 2  # passes over all posts that tell the noise scale, once exposures come from cells
+WEIGHINGS = 2  # passes over posts that tell the noise scale, once exposures come from cells
+FEW_BLOCKS = 64  # of rows, spread evenly, are enough for the first of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,14 +228,15 @@ def _fit(blocks, settings):
     problem = _pose(blocks, settings)
     solved, solution = solve(_pose(cells, settings))
     point = solution.value
-    weighted_with = point.scale
-    point.scale, point.repetition = weighting(point)
+    sums, weighted_with = point.sums, point.scale
+    point.scale, point.repetition = scale, repetition = weighting(sums)
     errors = standard_errors(solved, point)
     if cells is not blocks:
-        for _ in range(WEIGHINGS):
-            weighted_with = point.scale
-            point = visit(problem, point.state, point.mean_log_albedo, weighted_with, 1.0)
-            point.scale, point.repetition = weighting(point)
+        for every in (max(1, blocks.count // FEW_BLOCKS), *[1] * (WEIGHINGS - 1)):
+            weighted_with = scale
+            visitor = visitor_of(problem, point.state, weighted_with, is_step=False)
+            sums = accumulate(visitor, every)
+            scale, repetition = weighting(sums)
     groups = connected_groups(solved, solution.value)
     shared = slice(-SHARED - 1, -1)
     return Photometry(
@@ -243,8 +245,8 @@ def _fit(blocks, settings):
         shared_errors=np.where(problem.is_fitted[shared], errors[shared], np.nan),
         mean_log_albedo=float(point.mean_log_albedo),
         weighted_with=weighted_with,
-        noise=noise_scale(point.sums.histogram),
-        repetition=point.repetition,
+        noise=noise_scale(sums.histogram),
+        repetition=repetition,
         groups=[group.tolist() for group in groups],
         reasons=list(blocks.reasons),
         passes=blocks.passes,
@@ -267,7 +269,7 @@ def make_maps(problem, found):
     maps : iterator
         What `MapMaker` gives of each block, from north to south.
     """
-    visitor = visitor_of(problem, found.state, found.weighted_with)
+    visitor = visitor_of(problem, found.state, found.weighted_with, is_step=False)
     return problem.blocks.each(MapMaker(visitor, found.noise), "maps")
 
 

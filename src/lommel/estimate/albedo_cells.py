@@ -106,9 +106,9 @@ class Cells:
             setattr(self, name, getattr(self, name)[is_kept])
         self.images = [image for image, kept in zip(self.images, is_kept, strict=True) if kept]
 
-    def each(self, visit, name=None):
+    def each(self, visit, name=None, every=1):
         """As `SampleBlocks.each`, of which it is too quick to be told."""
-        return InThreads().each(visit, range(self.count), name)
+        return InThreads().each(visit, range(0, self.count, every), name)
 
     def span(self, block):
         """First row of a block, and the row behind its last one."""

@@ -91,9 +91,10 @@ class Point:
     objective: float
 
 
-def visitor_of(problem, state, scale):
-    """What a pass over the images does at these parameters."""
-    return Visitor(problem.blocks, problem.pairs, state, scale, LOSSES[problem.settings.loss])
+def visitor_of(problem, state, scale, is_step=True):
+    """What a pass over the images does at these parameters; see `Visitor`."""
+    loss = LOSSES[problem.settings.loss]
+    return Visitor(problem.blocks, problem.pairs, state, scale, loss, is_step)
 
 
 def visit(problem, state, mean_log_albedo, scale, repetition):

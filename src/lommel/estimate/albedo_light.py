@@ -115,6 +115,21 @@ def _normals(xyz, normals):
             normals[row, col, 2] = nz * inverse
 
 
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _arccos(cosine):
+    """Good to 2e-8 rad, a float32 step of 0.2 rad, and free of calls: loops become vector code.
+
+    The series is 4.4.46 of Abramowitz and Stegun, Handbook of Mathematical Functions.
+    """
+    x = min(abs(cosine), 1.0)
+    series = 0.0066700901 - 0.0012624911 * x
+    series = 0.0308918810 + x * (x * series - 0.0170881256)
+    series = 0.0889789874 + x * (x * series - 0.0501743046)
+    series = 1.5707963050 + x * (x * series - 0.2145988016)
+    angle = np.sqrt(1.0 - x) * series
+    return angle if cosine >= 0.0 else np.pi - angle
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _view(xyz, normals, first_row, first_col, sun, camera, planes):
     nadir = camera / np.sqrt(np.sum(camera * camera))
@@ -132,5 +147,6 @@ def _view(xyz, normals, first_row, first_col, sun, camera, planes):
             view = (nadir[0] * cx + nadir[1] * cy + nadir[2] * cz) * to_camera
             planes[0, i, j] = (nx * sx + ny * sy + nz * sz) * to_sun
             planes[1, i, j] = (nx * cx + ny * cy + nz * cz) * to_camera
-            planes[2, i, j] = np.arccos(min(max(phase, -1.0), 1.0))
-            planes[3, i, j] = np.arccos(min(view, 1.0)) ** 2
+            off_axis = _arccos(view)
+            planes[2, i, j] = _arccos(phase)
+            planes[3, i, j] = off_axis * off_axis

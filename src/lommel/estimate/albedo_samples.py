@@ -7,6 +7,7 @@ feathering, and the expected variance of its pixels. Most callers want `SampleBl
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 
 from lommel.core.reflectance import ReflectanceModel
 from lommel.estimate.albedo_arrays import BLOCKS, Pairs, Samples
@@ -215,7 +216,7 @@ class SampleBlocks:
             self._kept[block] = self.rows(*self.span(block))
         return self._kept[block]
 
-    def each(self, visit, name=None):
+    def each(self, visit, name=None, every=1):
         """One pass over the images: what a function of the number of a block gives, in order.
 
         Parameters
@@ -224,6 +225,8 @@ class SampleBlocks:
             As `lommel.jobs.InThreads.each` takes it.
         name : str, optional
             Of the pass; by default its number.
+        every : int
+            Only each so manieth block.
 
         Returns
         -------
@@ -231,7 +234,7 @@ class SampleBlocks:
         """
         self.passes += 1
         name = f"{name or f'pass {self.passes}'}, block"
-        return self.jobs.each(visit, range(self.count), name, TOGETHER)
+        return self.jobs.each(visit, range(0, self.count, every), name, TOGETHER)
 
     def rows(self, first, last):
         """Samples of the rows from first to before last; only these rows may be asked for.
@@ -262,13 +265,10 @@ class SampleBlocks:
 
     def _fill(self, planes, frame, part, terrain, level):
         measured, geometry, weight, reflectance, gradient = self.viewing.see(frame, part, terrain)
-        precision = _precision(level, reflectance, gradient, self.slope_noise)
-        if self.slope_noise is None:
-            precision[:] = np.float32(1.0 / np.median(self.levels) ** 2)
-        given = (measured, reflectance, geometry.phase, geometry.off_axis, weight, precision)
-        for plane, values in zip(planes, given, strict=True):
-            plane[:] = values
-            plane[np.isnan(plane)] = 0.0
+        noise = np.nan if self.slope_noise is None else self.slope_noise
+        same = 1.0 / np.median(self.levels) ** 2
+        given = (measured, reflectance, geometry.phase, geometry.off_axis, weight, gradient)
+        _store(*given, level, noise, same, planes)
 
 
 def block_edges(windows, shape):
@@ -513,11 +513,28 @@ def _strips(window, every):
         yield Window(window.row + first, window.col, rows, window.cols)
 
 
-def _precision(level, reflectance, gradient, slope_noise):
-    if slope_noise is None:
-        return np.empty_like(reflectance)
-    variance = level**2 * (reflectance**2 + (slope_noise * gradient) ** 2)
-    return 1.0 / np.maximum(variance, 1e-6 * level**2)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _store(
+    measured, reflectance, phase, off_axis, weight, gradient, level, slope_noise, same, planes
+):
+    """Planes of `Samples`, 0 where a value is unknown; without a noise precision is the same."""
+    rows, cols = measured.shape
+    for i in range(rows):
+        for j in range(cols):
+            answer, steepness = np.float64(reflectance[i, j]), slope_noise * gradient[i, j]
+            variance = level * level * max(answer * answer + steepness * steepness, 1e-6)
+            precision = same if np.isnan(slope_noise) else 1.0 / variance
+            planes[0, i, j] = _known(measured[i, j])
+            planes[1, i, j] = _known(reflectance[i, j])
+            planes[2, i, j] = _known(phase[i, j])
+            planes[3, i, j] = _known(off_axis[i, j])
+            planes[4, i, j] = _known(weight[i, j])
+            planes[5, i, j] = precision if precision > 0.0 else 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _known(value):
+    return value if value == value else np.float32(0.0)
 
 
 def _reason(has_ground, has_light, has_value, threshold):

@@ -58,7 +58,7 @@ def solve(problem):
     solution = _descend(rough, point, [], is_settled)
     for _ in range(TURNS):
         point = solution.value
-        scale, repetition = weighting(point)
+        scale, repetition = weighting(point.sums)
         if abs(np.log(scale / point.scale)) < SETTLED and point.repetition == 1.0:
             break
         point = visit(problem, point.state, point.mean_log_albedo, scale, 1.0)
@@ -87,10 +87,10 @@ def _shared_start(problem):
     return start
 
 
-def weighting(point):
+def weighting(sums):
     """Noise scale and repetition that the residuals show; 1 where one image shows none."""
-    scale = noise_scale(point.sums.histogram)
-    return scale if np.isfinite(scale) else 1.0, effective_repetition(point.sums)
+    scale = noise_scale(sums.histogram)
+    return scale if np.isfinite(scale) else 1.0, effective_repetition(sums)
 
 
 def _descend(problem, point, history, is_settled):
@@ -101,7 +101,7 @@ def _descend(problem, point, history, is_settled):
     for step in range(done, settings.max_steps):
         scale = point.scale
         if not is_settled:
-            scale = weighting(point)[0]
+            scale = weighting(point.sums)[0]
             is_settled = abs(np.log(scale / point.scale)) < SETTLED or step >= SETTLING
         moved, mean = _step(problem, point, damping)
         trial = visit(problem, moved, mean, scale, point.repetition)
