@@ -3,8 +3,9 @@
 import numba
 import numpy as np
 import pytest
+from scipy.interpolate import RegularGridInterpolator
 
-from lommel.core.plane import remove_plane
+from lommel.core.plane import plane_between, remove_plane
 
 ROUNDING = 2e-6  # of values of size 1, in float32
 
@@ -44,3 +45,19 @@ def test_any_number_of_threads_gives_the_same_bytes():
     finally:
         numba.set_num_threads(threads)
     np.testing.assert_array_equal(one, all_of_them)
+
+
+@pytest.mark.parametrize(("shape", "stride"), [((33, 50), 2), ((41, 41), 4), ((30, 17), 8)])
+def test_the_plane_between_coarse_posts_is_that_of_the_interpolated_field(shape, stride):
+    coarse = field([-(-(size - 1) // stride) + 1 for size in shape])
+    row, col = (np.arange(size) / stride for size in shape)
+    inside = RegularGridInterpolator([np.arange(size) for size in coarse.shape], coarse)
+    fine = inside(tuple(np.meshgrid(row, col, indexing="ij"))).astype(np.float32)
+    level = fine.copy()
+    remove_plane(level)
+    plane = plane_between(coarse, stride, shape)
+    np.testing.assert_allclose(
+        plane[:-1, :-1],
+        (fine - level)[::stride, ::stride][: coarse.shape[0] - 1, : coarse.shape[1] - 1],
+        atol=5 * ROUNDING,
+    )

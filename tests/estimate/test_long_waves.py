@@ -52,7 +52,7 @@ def test_tilts_of_parts_are_taken_back(halvings, left_share):
     blended = sum(share * error for share, error in zip(shares, errors, strict=True))
     for _ in range(halvings):
         blended = coarse_posts(np.ascontiguousarray(blended))
-    correction, _ = settle(parts, shape, 2, keeps_plane=False)
+    correction, _ = settle(parts, shape, 2, False, stride, grid.shape)
     assert np.std(blended + correction) < left_share * np.std(blended)
     assert abs(np.mean(correction)) < 1e-5  # m: the mean is left to the parts
 
@@ -74,7 +74,7 @@ def test_an_exposure_that_is_off_is_found_by_the_whole():
         share = np.zeros(shape, np.float32)
         share[place.slices] = 1
         parts.append(Part(left, Window(0, 0, *shape), place, share, [0, 1]))
-    _, change = settle(parts, shape, 2, keeps_plane=True)
+    _, change = settle(parts, shape, 2, True, 2, grid.shape)
     np.testing.assert_allclose(level.exposures + change, EXPOSURE, rtol=4e-5)
 
 

@@ -36,7 +36,7 @@ from lommel.core.normal_operator import (
     restrict,
     slope_adjoint,
 )
-from lommel.core.plane import remove_plane
+from lommel.core.plane import plane_between, remove_plane
 from lommel.estimate.problem import coarse_posts
 from lommel.scene.grid import Window
 
@@ -251,7 +251,7 @@ class _Settling(NormalEquations):
         self.add_exposures(-self.exposures_for @ self.pull_on_exposures(u), out)
 
 
-def settle(parts, shape, images, keeps_plane):
+def settle(parts, shape, images, keeps_plane, stride, posts):
     """What is to be added to the blended parts.
 
     Parameters
@@ -263,6 +263,10 @@ def settle(parts, shape, images, keeps_plane):
         Of the scene.
     keeps_plane : bool
         The mean plane of the initial surface, which exposures that are free cannot tell.
+    stride : int
+        Posts of the scene per coarse post.
+    posts : tuple of int
+        Of the scene.
 
     Returns
     -------
@@ -296,4 +300,8 @@ def settle(parts, shape, images, keeps_plane):
     step = conjugate_gradients(equations, -gradient, REDUCTION, MOST_CYCLES, keeps_plane).x
     exposures = -equations.exposures_for @ (on_exposures + equations.pull_on_exposures(step))
     # images tell no mean height, and where parts meet, coarse posts do not balance quite
-    return settled - change + (step if keeps_plane else step - step.mean()), exposures
+    if not keeps_plane:
+        return settled - change + step - step.mean(), exposures
+    settled += step
+    settled -= plane_between(settled, stride, posts).astype(np.float32)
+    return settled - change, exposures

@@ -43,7 +43,7 @@ def settle_tiles(run, work, known):
         images = [known.names.index(name) for name in names]
         parts.append(Part(left, place, _own(tile, plan, shape), share, images))
     free = frees_exposures(run.settings)
-    correction, change = settle(parts, shape, len(known.names), keeps_plane=free)
+    correction, change = settle(parts, shape, len(known.names), free, plan.stride, plan.shape)
     return correction, known.exposures + change
 
 
