@@ -194,6 +194,7 @@ def solve_surface(
     photometry=None,
     measured=None,
     start=None,
+    maps=True,
 ):
     """Refine a surface by the shading in images.
 
@@ -214,11 +215,14 @@ def solve_surface(
     measured : bool array (rows, cols), optional
         Posts that were measured, the others being interpolated; all of them by default.
     start : Start, optional
+    maps : bool
+        Whether albedo, modelled images and `separation` are wanted, or the surface alone.
 
     Returns
     -------
     solution : Solution
-        Its value is a `SurfaceSolution`.
+        Its value is a `SurfaceSolution`; of maps that are not wanted, albedo is as it was and the
+        others are empty.
     """
     settings = settings or SolverSettings()
     if albedo is not None:
@@ -271,9 +275,9 @@ def solve_surface(
         sums = here.sums
     misfits = np.sqrt(sums[:, SUM_RR] / np.maximum(sums[:, SUM_COUNT], 1))
     left = misfits if start is None else start.misfits
-    if settings.estimate_albedo and not is_joint and left.max() > EXPLAINED:
+    if maps and settings.estimate_albedo and not is_joint and left.max() > EXPLAINED:
         _fit_albedo(finest, u, priors, left, settings)
-    modelled = [finest.predict(u, k) for k in range(len(views))]
+    modelled = [finest.predict(u, k) for k in range(len(views))] if maps else []
     value = SurfaceSolution(
         u,
         finest.albedo,
@@ -283,7 +287,7 @@ def solve_surface(
         modelled,
         correlations,
         misfits,
-        separation(finest, u),
+        separation(finest, u) if maps else np.empty((0, 0), np.float32),
         priors,
         left_over,
     )

@@ -128,6 +128,7 @@ def prepare_scene(footprints, stride, settings, progress=silent):
             replace(settings.solver, gain_tolerance=START_GAIN, step_tolerance=START_STEP),
             albedo,
             photometry,
+            maps=False,
         )
     value = solution.value
     ratio = np.nanmedian(exposures / value.exposures)
