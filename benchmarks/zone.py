@@ -29,7 +29,7 @@ WEEK = 7 * 86_400.0
 ONE_IMAGE = 2 * (789 - 63) / 4e8  # per post, to solve with one image and write
 PREPARE = 2 * 63 / 4.3e8  # per pixel: digest, samples, coarse stage; at most, it has the DEM in it
 FURTHER = 0.25e-6  # per post of a tile and further image
-ALBEDO = 2 * 429 / 1e9  # per pixel of 40 orthoimages of 5000 x 5000, all of the command
+ALBEDO = 2 * 386 / 1e9  # per pixel of 40 orthoimages of 5000 x 5000, all of the command
 ANEW = 1.25  # workers compute samples in every pass
 SCRATCH, PRODUCTS, OWN_PRODUCTS = 36, 25, 7  # bytes per post: tiles; products of sfs, of albedo
 
