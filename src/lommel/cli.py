@@ -329,6 +329,8 @@ def sfs(
     )
     files = _files(images, dem, sun_positions, spacecraft_positions, positions_unit, cameras)
     grid = _grid(spacing, crs, bounds)
+    if tiles is not None and engine is None:
+        engine = "serial"  # each share has a job's memory for itself
     tiling = Tiling(
         None if memory is None else read_memory(memory), engine, scheduler=dask_scheduler
     )

@@ -69,6 +69,24 @@ def test_what_cannot_be_sent_is_raised_and_the_process_goes_on():
         assert workers.submit(math.sqrt, 4).result() == 2
 
 
+def test_a_process_that_cannot_be_started_is_an_error_of_its_call_alone(monkeypatch):
+    with Workers(1) as workers:
+        monkeypatch.setattr(apart, "CHILD", "raise SystemExit(5)")
+        with pytest.raises(ProcessLost, match="status 5"):
+            workers.submit(math.sqrt, 4).result()
+        monkeypatch.setattr(sys, "executable", "/no/such/program")
+        with pytest.raises(OSError, match="no/such/program"):
+            workers.submit(math.sqrt, 4).result()
+        monkeypatch.undo()
+        assert workers.submit(math.sqrt, 4).result() == 2
+
+
+def test_an_error_that_cannot_be_sent_is_told_in_words():
+    code = "def f(n):\n class Own(Exception): pass\n raise Own('words')"
+    with Workers(1) as workers, pytest.raises(LommelError, match="Own: words"):
+        workers.submit(exec, f"{code}\nf(1)").result()
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 def test_processes_end_with_the_one_that_waits_for_them():
     waiting = subprocess.Popen([sys.executable, "-c", SLEEPING])

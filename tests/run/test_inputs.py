@@ -96,6 +96,8 @@ def test_posts_that_images_have_in_common_are_kept():
     images = [mosaic.cut(Window(60, 200, 90, 80)), mosaic.cut(Window(20, 70, 100, 150))]
     grid = choose_grid(images, [mosaic], GridSettings())
     assert grid.is_same(mosaic.cut(Window(20, 70, 130, 210)))
+    south_up = [replace(g, affine=g.affine @ Affine.scale(1, -1)) for g in images]
+    assert choose_grid(south_up, [mosaic], GridSettings()).is_north_up
     moved = replace(images[1], affine=images[1].affine @ Affine.translation(0.5, 0))
     assert choose_grid([images[0], moved], [mosaic], GridSettings()).offset_in(mosaic) is None
 

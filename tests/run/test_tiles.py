@@ -27,7 +27,7 @@ from lommel.run.tiles_plan import (
     read_memory,
     work_folder,
 )
-from lommel.run.tiles_records import part_folder
+from lommel.run.tiles_records import part_folder, save_run
 from lommel.scene.grid import Window
 
 from .tiled_scene import SIDE, files_of, fingerprints
@@ -90,10 +90,23 @@ def test_tiles_go_to_processes_where_these_have_room_for_large_ones(
 def test_the_tiles_of_an_earlier_run_are_not_too_much_for_processes(monkeypatch, tmp_path):
     """A tile of 5,120 posts needs 6.5 GB."""
     monkeypatch.setattr(tiles_plan, "cores", lambda: 2)
-    monkeypatch.setattr(tiles_plan, "earlier_cut", lambda folder: (5120, 4))
-    monkeypatch.setattr(tiles_plan, "free_memory", lambda: 8e9 / tiles_plan.MEMORY_SHARE)
-    plan = plan_tiles(footprints_of((20_000, 20_000)), Tiling(), tmp_path / "out")
+    monkeypatch.setattr(tiles_plan, "earlier_cut", lambda folder, shape: (5120, 4))
+    plan = plan_tiles(footprints_of((20_000, 20_000)), Tiling(8e9), tmp_path / "out")
     assert (plan.side, plan.workers) == (5120, 1)
+    plan = plan_tiles(footprints_of((20_000, 20_000)), Tiling(6e9), tmp_path / "out")
+    assert plan.side < 5120 and plan.memory <= 6e9
+
+
+def test_a_broken_run_goes_on_with_other_cores_and_engines(monkeypatch, tmp_path):
+    footprints, plans = footprints_of((20_000, 20_000)), []
+    for cores in (2, 16, 1):
+        monkeypatch.setattr(tiles_plan, "cores", lambda cores=cores: cores)
+        plans.append(plan_tiles(footprints, Tiling(8e9), tmp_path / "out"))
+        work = tiles_plan.work_folder(tmp_path / "out")
+        work.mkdir(exist_ok=True)
+        save_run(work, SimpleNamespace(plan=plans[0]))
+    plans.append(plan_tiles(footprints, Tiling(8e9, "serial"), tmp_path / "out"))
+    assert [plan.cut for plan in plans] == [plans[0].cut] * 4
 
 
 def test_too_little_memory_is_refused_with_what_is_needed():

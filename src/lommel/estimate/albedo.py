@@ -236,7 +236,8 @@ def _fit(blocks, settings):
             weighted_with = scale
             visitor = visitor_of(problem, point.state, weighted_with, is_step=False)
             sums = accumulate(visitor, every)
-            scale, repetition = weighting(sums)
+            if every == 1 or np.isfinite(noise_scale(sums.histogram)):  # else no overlap is there
+                scale, repetition = weighting(sums)
     groups = connected_groups(solved, solution.value)
     shared = slice(-SHARED - 1, -1)
     return Photometry(

@@ -117,7 +117,7 @@ def _normals(xyz, normals):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _arccos(cosine):
-    """Good to 2e-8 rad, a float32 step of 0.2 rad, and free of calls: loops become vector code.
+    """Good to 2.2e-8 rad, two float32 steps of 0.2 rad, without a call: loops become vector code.
 
     The series is 4.4.46 of Abramowitz and Stegun, Handbook of Mathematical Functions.
     """

@@ -72,20 +72,24 @@ class Workers:
         return self.threads.submit(self._call, function, arguments)
 
     def _call(self, function, arguments):
-        process = self.idle.get() or self._start()
+        question = pickle.dumps((function, arguments))
+        process = self.idle.get()
         try:
-            told = _ask(process, pickle.dumps((function, arguments)))
-        except BaseException:
-            self.idle.put(process)
+            process = process or self._start()
+            told = _ask(process, question)
+            if told is None:
+                raise ProcessLost(
+                    f"A process ended with status {process.wait()} before it was done: ended "
+                    "by someone, or by the system for want of memory. The same command goes on "
+                    "from there."
+                )
+        except BaseException:  # what it would still say is no answer to the next question
+            if process is not None:
+                self._bury(process)
+            process = None
             raise
-        if told is None:
-            self._bury(process)
-            self.idle.put(None)
-            raise ProcessLost(
-                f"A process ended with status {process.returncode} before it was done: ended by "
-                "someone, or by the system for want of memory. The same command goes on from there."
-            )
-        self.idle.put(process)
+        finally:
+            self.idle.put(process)
         result, error = pickle.loads(told)
         if error is not None:
             raise error
@@ -168,7 +172,12 @@ def _answer(question):
         function, arguments = pickle.loads(question)
         return pickle.dumps((function(*arguments), None))
     except Exception as error:  # raised where the result is waited for
-        return pickle.dumps((None, error))
+        try:
+            told = pickle.dumps((None, error))
+            pickle.loads(told)
+        except Exception:  # not everything can be sent
+            return pickle.dumps((None, LommelError(f"{type(error).__name__}: {error}")))
+        return told
 
 
 def _listen(questions):

@@ -200,7 +200,9 @@ def choose_grid(image_grids, dem_grids, settings, prefer="images", body=MOON):
 
 
 def _common_lattice(grids):
-    """The grid around all of them whose posts are theirs; None where theirs do not coincide."""
+    """The north-up grid around all of them whose posts are theirs; None where there is none."""
+    if not grids[0].is_north_up:
+        return None
     offsets = [grid.offset_in(grids[0]) for grid in grids]
     if None in offsets:
         return None

@@ -38,7 +38,8 @@ from lommel.scene.geometry import Observation
 from lommel.scene.grid import Grid, Window
 
 BAND = 512  # rows read together: tiles of GeoTIFFs are as high, and each is unpacked once or twice
-POSTS_AT_ONCE = 2**24  # of terrain or of an orthoimage while it is read, at most
+POSTS_AT_ONCE = 2**22  # of an orthoimage while it is read, at most, 40 bytes each
+SQUARES = 4  # times as many of the terrain, which is put together of squares
 SQUARE = 768  # posts along each side of the parts of a raw image, 500 bytes each
 
 
@@ -180,7 +181,7 @@ def read_placed(placed, jobs=None, store=Held.rows, stamps=None):
     jobs, stamps = jobs or InThreads(), stamps or {}
     common = replace(placed, places=[], skipped=[])  # a job needs no place but its own
     grid, skipped = placed.grid, list(placed.skipped)
-    numbered = list(enumerate(_bands(grid.window)))
+    numbered = list(enumerate(_bands(grid.window, SQUARES * POSTS_AT_ONCE)))
     found = list(jobs.each(ReadTerrain(common, store, stamps), numbered, "terrain", threads=1))
     if not any(is_known for _, is_known in found):
         raise InputError(
@@ -262,9 +263,9 @@ class ReadImage:
         refuse_changed(self.stamps, [place.path])
 
 
-def _bands(window):
-    """All columns of some rows each, from north to south."""
-    return window.parts(max(1, min(BAND, POSTS_AT_ONCE // window.cols)))
+def _bands(window, posts):
+    """All columns of some rows each, from north to south, so many posts at most."""
+    return window.parts(max(1, min(BAND, posts // window.cols)))
 
 
 def _circumstances(place, placed):
@@ -294,7 +295,7 @@ def _checked_rows(place, placed, heights):
 
 
 def _flat_rows(place, placed):
-    for part in _bands(place.window):
+    for part in _bands(place.window, POSTS_AT_ONCE):
         yield part, read_image_on_grid(place.path, placed.grid.cut(part), placed.terrain.body)
 
 

@@ -45,7 +45,7 @@ class Held:
 
 
 class Rows:
-    """Indexed by rows as an array is, some of them read at a time; for `StoredRows` and others.
+    """Indexed by rows, and by a slice of columns, as an array is, and read anew each time.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class StoredRows(Rows):
         low, high, _ = cols.indices(width)
         values = np.empty((last - first, max(high - low, 0)), np.float32)
         try:
-            with open(self.path, "rb", buffering=0) as file:
+            with open(self.path, "rb") as file:
                 if values.shape[1] == width:
                     self._fill(file, first * width, values)
                 else:

@@ -6,7 +6,6 @@ Most callers want `make_plan`.
 import json
 import os
 import re
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from math import ceil, inf
 from pathlib import Path
@@ -285,26 +284,32 @@ def plan_tiles(footprints, tiling, output):
     -------
     plan : Plan
     """
-    tiling = tiling or Tiling()
-    side, stride, shape = tiling.side, None, footprints.grid.shape
-    if tiling.memory is None and side is None:
-        side, stride = earlier_cut(work_folder(output))
-    memory = free_memory() * MEMORY_SHARE if tiling.memory is None else tiling.memory
+    tiling, shape = tiling or Tiling(), footprints.grid.shape
+    free = free_memory()
+    memory = free * MEMORY_SHARE if tiling.memory is None else tiling.memory
     images = len(footprints.used.images)
 
     def count(window):
         return int(footprints.uses(window).sum())
 
-    def plan(workers):
-        return make_plan(shape, images, memory, side, stride, count, workers)
+    def quickest(side, stride, most):
+        plans = []
+        for workers in [tiling.workers] if tiling.engine else range(1, cores() + 1):
+            try:
+                plans.append(make_plan(shape, images, memory, side, stride, count, workers))
+            except InputError:
+                if not plans:
+                    raise
+                break  # too little memory for so many
+        return min((p for p in plans if p is plans[0] or p.memory <= most), key=_tile_time)
 
-    if tiling.engine is not None:
-        return plan(tiling.workers)
-    plans = [plan(1)]
-    for workers in range(2, cores() + 1):
-        with suppress(InputError):  # too little memory for so many
-            plans.append(plan(workers))
-    return min((one for one in plans if one.workers == 1 or one.memory <= memory), key=_tile_time)
+    cut = earlier_cut(work_folder(output), shape) if tiling.side is None else None
+    if cut is not None:
+        most = free if tiling.memory is None else memory
+        plan = quickest(*cut, most)
+        if plan.memory <= most:
+            return plan
+    return quickest(tiling.side, None, memory)
 
 
 def _tile_time(plan):
@@ -321,13 +326,13 @@ def work_folder(output):
     return output.with_name(f".{output.name}.tiles")
 
 
-def earlier_cut(folder):
+def earlier_cut(folder, shape):
     """Side of the tiles and stride of the coarse grid of a broken run, posts; None without one."""
     try:
         plan = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
-        return int(plan["side"]), int(plan["stride"])
+        return (int(plan["side"]), int(plan["stride"])) if plan["shape"] == list(shape) else None
     except (OSError, ValueError, KeyError, TypeError):
-        return None, None
+        return None
 
 
 def _even_side(shape, most):

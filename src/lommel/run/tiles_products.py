@@ -109,7 +109,7 @@ def _write_products(folder, grid, plan, work, correction, progress):
 
 
 def _writers(plan):
-    """Processes that write products: as many as the cores, and what a tile takes, have room for."""
+    """Processes that write products: as many as cores and the memory of the run have room for."""
     if plan.shape[0] * plan.shape[1] < WORTH_PROCESSES:
         return 1
     rows, cols = plan.tiles[0].inner.shape

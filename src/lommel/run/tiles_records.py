@@ -64,7 +64,7 @@ def save_run(work, run):
     work : Path
     run : TiledRun
     """
-    plan = {"side": run.plan.side, "stride": run.plan.stride}
+    plan = {"shape": run.plan.shape, "side": run.plan.side, "stride": run.plan.stride}
     write_whole(work / RUN, pickle.dumps(run))
     write_whole(work / "plan.json", json.dumps(plan).encode())
 

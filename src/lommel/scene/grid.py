@@ -99,6 +99,12 @@ class Grid:
         return Window(0, 0, *self.shape)
 
     @property
+    def is_north_up(self):
+        """Whether rows run along x and columns down y."""
+        a, b, _, d, e, _ = self.affine[:6]
+        return a > 0 > e and b == d == 0
+
+    @property
     def bounds(self):
         """Outer pixel edges xmin, ymin, xmax, ymax, in CRS units."""
         rows, cols = self.shape
