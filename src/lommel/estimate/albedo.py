@@ -44,7 +44,7 @@ from lommel.estimate.albedo_settings import AlbedoSettings, check_settings
 from lommel.estimate.albedo_solver import solve, weighting
 
 WEIGHINGS = 2  # passes over posts that tell the noise scale, once exposures come from cells
-FEW_BLOCKS = 64  # of rows, spread evenly, are enough for the first of them
+FEW_BLOCKS = 64  # of rows, spread evenly, are enough for all but the last of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +232,8 @@ def _fit(blocks, settings):
     point.scale, point.repetition = scale, repetition = weighting(sums)
     errors = standard_errors(solved, point)
     if cells is not blocks:
-        for every in (max(1, blocks.count // FEW_BLOCKS), *[1] * (WEIGHINGS - 1)):
+        for left in reversed(range(WEIGHINGS)):
+            every = max(1, blocks.count // FEW_BLOCKS) if left else 1
             weighted_with = scale
             visitor = visitor_of(problem, point.state, weighted_with, is_step=False)
             sums = accumulate(visitor, every)

@@ -33,7 +33,6 @@ from lommel.estimate.albedo_rows import (
     LEAST_SQUARES,
     brightness_row,
     count_row,
-    derive_row,
     dot3,
     image_sums,
     inner,
@@ -61,18 +60,10 @@ def _first_sweep(row, here, samples, images, state, is_step, work, maps):
             samples.off_axis[part],
             state.exposure[k],
             state.shared,
+            is_step,
             work.brightness[a, :width],
+            work.derivatives[a, :, :width],
         )
-        if is_step:
-            derive_row(
-                samples.reflectance[part],
-                samples.phase[part],
-                samples.off_axis[part],
-                state.exposure[k],
-                state.shared,
-                work.brightness[a, :width],
-                work.derivatives[a, :, :width],
-            )
         count_row(samples.weight[part], count[cols], freedom[cols])
     for j in range(count.size):
         if count[j] > 0:
@@ -289,8 +280,8 @@ class Visitor:
     loss : int
         LEAST_SQUARES, HUBER or CAUCHY.
     is_step : bool
-        Whether what a Gauss-Newton step needs is summed as well; else only residuals are, in two
-        thirds of the time.
+        Whether what a Gauss-Newton step needs is summed as well; else only residuals are, in half to
+        two thirds of the time.
     """
 
     blocks: object

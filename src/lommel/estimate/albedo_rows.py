@@ -72,8 +72,10 @@ def robust_loss(x, loss):
 
 
 @inner
-def brightness_row(reflectance, phase, off_axis, exposure, shared, brightness):
-    """Brightness of albedo 1 along a row.
+def brightness_row(
+    reflectance, phase, off_axis, exposure, shared, is_step, brightness, derivatives
+):
+    """Brightness of albedo 1 along a row, and for a step its derivatives by c1, c2, v2 and v4.
 
     Parameters
     ----------
@@ -81,27 +83,23 @@ def brightness_row(reflectance, phase, off_axis, exposure, shared, brightness):
     exposure : float
     shared : float64 array (4,)
         c1 (per rad), c2, v2 (per rad^2), v4 (per rad^4).
+    is_step : bool
     brightness : float64 array (cols,)
         Overwritten.
+    derivatives : float64 array (4, cols)
+        Overwritten for a step.
     """
     c1, c2, v2, v4 = shared[0], shared[1], shared[2], shared[3]
     for j in range(reflectance.size):
         square = off_axis[j]
+        decay = np.exp(-c1 * phase[j])
         level = exposure * reflectance[j] * np.exp(-square * (v2 + v4 * square))
-        brightness[j] = level * (np.exp(-c1 * phase[j]) + c2)
-
-
-@inner
-def derive_row(reflectance, phase, off_axis, exposure, shared, brightness, derivatives):
-    """Derivatives of that brightness by c1, c2, v2 and v4, float64 array (4, cols), overwritten."""
-    c1, v2, v4 = shared[0], shared[2], shared[3]
-    for j in range(reflectance.size):
-        square = off_axis[j]
-        level = exposure * reflectance[j] * np.exp(-square * (v2 + v4 * square))
-        derivatives[0, j] = -phase[j] * np.exp(-c1 * phase[j]) * level
-        derivatives[1, j] = level
-        derivatives[2, j] = -square * brightness[j]
-        derivatives[3, j] = -square * square * brightness[j]
+        brightness[j] = level * (decay + c2)
+        if is_step:
+            derivatives[0, j] = -phase[j] * decay * level
+            derivatives[1, j] = level
+            derivatives[2, j] = -square * brightness[j]
+            derivatives[3, j] = -square * square * brightness[j]
 
 
 @inner

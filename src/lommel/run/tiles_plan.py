@@ -50,7 +50,7 @@ class Tiling:
     scheduler : str or None
         Address of a Dask cluster that runs already; None starts one on this machine.
     processes : int or None
-        Of this machine at work at a time; None takes one per core.
+        At work at a time, where they do the work; None takes one per core.
     """
 
     memory: float | None = None
@@ -67,8 +67,8 @@ class Tiling:
             return
         if self.engine != "dask":
             raise InputError(
-                f"--dask-scheduler {self.scheduler} goes with --engine dask, not "
-                f"{self.engine or 'without --engine'}."
+                f"--dask-scheduler {self.scheduler} needs --engine dask"
+                + (f", not {self.engine}." if self.engine else ".")
             )
         if self.memory is None and self.side is None:
             raise InputError(
