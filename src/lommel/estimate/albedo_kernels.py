@@ -280,8 +280,8 @@ class Visitor:
     loss : int
         LEAST_SQUARES, HUBER or CAUCHY.
     is_step : bool
-        Whether what a Gauss-Newton step needs is summed as well; else only residuals are, in half to
-        two thirds of the time.
+        Whether what a Gauss-Newton step needs is summed as well; else only residuals are, in
+        half to two thirds of the time.
     """
 
     blocks: object
