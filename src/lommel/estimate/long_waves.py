@@ -40,7 +40,7 @@ from lommel.core.plane import plane_between, remove_plane
 from lommel.estimate.problem import coarse_posts
 from lommel.scene.grid import Window
 
-REDUCTION = 1e-3  # of the linear residual: a thousandth of a step that is itself small
+REDUCTION = 1e-2  # of the linear residual: a hundredth of a step of some centimetres
 MOST_CYCLES = 60
 
 
