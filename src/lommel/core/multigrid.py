@@ -30,6 +30,7 @@ from lommel.core.normal_operator import (
     prolong,
     prolong_add,
     restrict,
+    subtract_operator,
 )
 from lommel.core.plane import remove_plane
 
@@ -61,7 +62,6 @@ class Level:
     x: np.ndarray
     residual: np.ndarray
     step: np.ndarray
-    image: np.ndarray
 
     @property
     def shape(self):
@@ -73,6 +73,12 @@ class Level:
         apply_operator(u, *self.tensors, self.curvature, self.hourglass, self.mass, out)
         if self.long_masses.any():
             add_long_waves(u, self.long_masses, out)
+
+    def subtract(self, u, out):
+        """``out -= A u``, as in `apply`."""
+        subtract_operator(u, *self.tensors, self.curvature, self.hourglass, self.mass, out)
+        if self.long_masses.any():
+            add_long_waves(u, -self.long_masses, out)
 
 
 class NormalEquations:
@@ -168,23 +174,25 @@ class NormalEquations:
         x : float32 array (rows, cols)
             A work array: it is overwritten by the next call.
         """
-        self._cycle(0, right_hand_side)
+        np.copyto(self.levels[0].residual, right_hand_side)
+        self._cycle(0)
         return self.levels[0].x
 
-    def _cycle(self, depth, right_hand_side):
+    def _cycle(self, depth):
+        """From the residual of a level to its ``x``."""
         level = self.levels[depth]
         if depth == len(self.levels) - 1:
-            np.copyto(level.x, (self._inverse @ right_hand_side.ravel()).reshape(level.shape))
+            np.copyto(level.x, (self._inverse @ level.residual.ravel()).reshape(level.shape))
             return
         coarse = self.levels[depth + 1]
         with threads_for(level.shape):
-            _smooth_from_zero(level, right_hand_side)
+            _smooth_from_zero(level)
             restrict(level.residual, coarse.residual)
-        self._cycle(depth + 1, coarse.residual)
+        self._cycle(depth + 1)
         with threads_for(level.shape):
             prolong(coarse.x, level.step)
-            level.apply(level.step, level.image)
-            _take_step(level.x, level.residual, level.step, level.image, np.float32(1))
+            prolong_add(coarse.x, level.x)
+            level.subtract(level.step, level.residual)
             _smooth_last(level)
 
 
@@ -316,7 +324,7 @@ def _add_long_waves(u, masses, out):
         if level < masses.size - 1:
             total *= NORMALISED
             prolong_add(total, pull)
-        if mass > 0:
+        if mass != 0:
             energy += mass * _block_dots(low, low).sum()
             pull += np.float32(mass) * low
         total = pull
@@ -387,7 +395,7 @@ def _row_dot(a, b):
 def _level(shape, tensors, curvature, hourglass, mass, degree, longer=()):
     """Coefficients of a grid, and its work arrays."""
     long_masses = np.array([0.0, *longer])
-    inverse, *work = (np.zeros(shape, np.float32) for _ in range(5))
+    inverse, *work = (np.zeros(shape, np.float32) for _ in range(4))
     hourglass = np.float32(hourglass)
     return Level(tensors, curvature, hourglass, mass, degree, inverse, long_masses, *work)
 
@@ -403,12 +411,12 @@ def coarse_masses(masses, halvings):
 def _dense_inverse(level):
     count = level.x.size
     matrix = np.empty((count, count))
-    probe = np.zeros(level.shape, np.float32)
+    probe, image = np.zeros((2, *level.shape), np.float32)
     with threads_for(level.shape):
         for k in range(count):
             probe.ravel()[k] = 1.0
-            level.apply(probe, level.image)
-            matrix[k] = level.image.ravel()
+            level.apply(probe, image)
+            matrix[k] = image.ravel()
             probe.ravel()[k] = 0.0
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     # float32 coefficients know eigenvalues to 1e-6 of the largest: less is the null space
@@ -417,25 +425,24 @@ def _dense_inverse(level):
     return inverse.astype(np.float32)
 
 
-def _smooth_from_zero(level, right_hand_side):
-    """Chebyshev iteration on the upper spectrum, which makes ``x`` and ``residual``."""
+def _smooth_from_zero(level):
+    """Chebyshev iteration on the upper spectrum; ``residual`` becomes what ``x`` leaves of it."""
     (_, scale), *later = _chebyshev(level.degree)
-    _first_step(level.x, level.step, right_hand_side, level.inverse_diagonal, scale)
-    level.apply(level.step, level.image)
-    _difference(right_hand_side, level.image, level.residual)
+    _first_step(level.x, level.step, level.residual, level.inverse_diagonal, scale)
+    level.subtract(level.step, level.residual)
     for keep, scale in later:
-        _redirect_scaled(level.step, level.residual, level.inverse_diagonal, keep, scale)
-        level.apply(level.step, level.image)
-        _take_step(level.x, level.residual, level.step, level.image, np.float32(1))
+        _next_step(level.x, level.step, level.residual, level.inverse_diagonal, keep, scale)
+        level.subtract(level.step, level.residual)
 
 
 def _smooth_last(level):
     """The same from where ``x`` is; the last step leaves ``residual``, which nobody asks for."""
     *earlier, (keep, scale) = _chebyshev(level.degree)
     for keep_more, scale_more in earlier:
-        _redirect_scaled(level.step, level.residual, level.inverse_diagonal, keep_more, scale_more)
-        level.apply(level.step, level.image)
-        _take_step(level.x, level.residual, level.step, level.image, np.float32(1))
+        _next_step(
+            level.x, level.step, level.residual, level.inverse_diagonal, keep_more, scale_more
+        )
+        level.subtract(level.step, level.residual)
     _last_step(level.x, level.step, level.residual, level.inverse_diagonal, keep, scale)
 
 
@@ -454,9 +461,9 @@ def _chebyshev(degree):
 
 
 @njit(cache=True, parallel=True, fastmath={"contract", "nsz"})
-def _first_step(x, step, right_hand_side, inverse_diagonal, scale):
+def _first_step(x, step, residual, inverse_diagonal, scale):
     for i in prange(x.shape[0]):
-        a, s, r, d = x[i], step[i], right_hand_side[i], inverse_diagonal[i]
+        a, s, r, d = x[i], step[i], residual[i], inverse_diagonal[i]
         for c in range(a.size):
             s[c] = scale * d[c] * r[c]
         for c in range(a.size):
@@ -464,11 +471,13 @@ def _first_step(x, step, right_hand_side, inverse_diagonal, scale):
 
 
 @njit(cache=True, parallel=True, fastmath={"contract", "nsz"})
-def _difference(a, b, out):
-    for i in prange(out.shape[0]):
-        x, y, z = a[i], b[i], out[i]
-        for c in range(z.size):
-            z[c] = x[c] - y[c]
+def _next_step(x, step, residual, inverse_diagonal, keep, scale):
+    for i in prange(x.shape[0]):
+        a, s, r, d = x[i], step[i], residual[i], inverse_diagonal[i]
+        for c in range(a.size):
+            s[c] = keep * s[c] + scale * d[c] * r[c]
+        for c in range(a.size):
+            a[c] += s[c]
 
 
 @njit(cache=True, parallel=True, fastmath={"contract", "nsz"})
@@ -477,14 +486,6 @@ def _last_step(x, step, residual, inverse_diagonal, keep, scale):
         a, s, r, d = x[i], step[i], residual[i], inverse_diagonal[i]
         for c in range(a.size):
             a[c] += keep * s[c] + scale * d[c] * r[c]
-
-
-@njit(cache=True, parallel=True, fastmath={"contract", "nsz"})
-def _redirect_scaled(step, residual, inverse_diagonal, keep, scale):
-    for i in prange(step.shape[0]):
-        s, r, d = step[i], residual[i], inverse_diagonal[i]
-        for c in range(s.size):
-            s[c] = keep * s[c] + scale * d[c] * r[c]
 
 
 @njit(cache=True, parallel=True, fastmath={"contract", "nsz"})

@@ -24,33 +24,31 @@ LARGEST_EIGENVALUE = 4.0  # of diag(A)^-1 A: the number of posts of the largest 
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath={"contract", "nsz"})
-def _cell_fluxes(upper, lower, gpp, gpq, gqq, twist, hourglass, top0, top1, bottom0, bottom1):
-    """What one row of cells adds to the posts above and below it.
+def _cell_flux(upper, lower, c, gpp, gpq, gqq, twist, hourglass):
+    """What the cell right of the post ``c`` adds to its four posts, as three numbers.
 
-    Buffers hold one entry per cell, shifted by one, with zeros at both ends: the post ``c`` takes
-    ``top0[c + 1]`` from the cell at its right and ``top1[c]`` from the one at its left.
+    The upper left post gets bend - total, the upper right one difference - bend, the lower left
+    one -difference - bend, the lower right one total + bend.
     """
     half = np.float32(0.5)
-    for c in range(gpp.size):
-        down_left = lower[c] - upper[c]
-        down_right = lower[c + 1] - upper[c + 1]
-        p = half * (upper[c + 1] - upper[c] + lower[c + 1] - lower[c])
-        q = half * (down_left + down_right)
-        fp = half * (gpp[c] * p + gpq[c] * q)
-        fq = half * (gpq[c] * p + gqq[c] * q)
-        bend = (twist + hourglass * (gpp[c] + gqq[c])) * (down_right - down_left)
-        top0[c + 1] = bend - fp - fq
-        top1[c + 1] = fp - fq - bend
-        bottom0[c + 1] = fq - fp - bend
-        bottom1[c + 1] = fp + fq + bend
+    left, right = lower[c] - upper[c], lower[c + 1] - upper[c + 1]
+    p = half * ((upper[c + 1] - upper[c]) + (lower[c + 1] - lower[c]))
+    q = half * (left + right)
+    fp = half * (gpp[c] * p + gpq[c] * q)
+    fq = half * (gpq[c] * p + gqq[c] * q)
+    bend = (twist + hourglass * (gpp[c] + gqq[c])) * (right - left)
+    return fp + fq, fp - fq, bend
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath={"contract", "nsz"})
-def _second_differences(u, out):
-    """``out[c + 1] = u[c - 1] - 2 u[c] + u[c + 1]`` inside, zero at both ends."""
-    two = np.float32(2.0)
-    for c in range(1, u.size - 1):
-        out[c + 1] = u[c - 1] - two * u[c] + u[c + 1]
+def _cells_above(upper, lower, gpp, gpq, gqq, twist, hourglass, above):
+    """``above[c]``: what the cells between two rows add to the posts of the lower one."""
+    last_total = last_bend = np.float32(0)
+    for c in range(gpp.size):
+        total, difference, bend = _cell_flux(upper, lower, c, gpp, gpq, gqq, twist, hourglass)
+        above[c] = (last_total + last_bend) - (difference + bend)
+        last_total, last_bend = total, bend
+    above[gpp.size] = last_total + last_bend
 
 
 @njit(cache=True, nogil=True, forceinline=True)
@@ -66,18 +64,97 @@ def _column_weights(row, rows, weights):
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath={"contract", "nsz"})
-def _gather_row(u_2, u_1, u0, u1, u2, w, wxx, mass, bend, top0, top1, bottom0, bottom1, out):
-    """Sum of all terms at the posts of one row."""
-    w_2, w_1, w0, w1, w2 = w[0], w[1], w[2], w[3], w[4]
-    two = np.float32(2.0)
-    for c in range(out.size):
-        along = bend[c] - two * bend[c + 1] + bend[c + 2]
-        across = w_2 * u_2[c] + w_1 * u_1[c] + w0 * u0[c] + w1 * u1[c] + w2 * u2[c]
-        cells = (top0[c + 1] + top1[c]) + (bottom0[c + 1] + bottom1[c])
-        out[c] = cells + wxx * along + across + mass[c] * u0[c]
+def _across(rows, w, c):
+    """Second differences along the column ``c`` and their transpose, from five rows."""
+    return (
+        w[0] * rows[0][c]
+        + w[1] * rows[1][c]
+        + w[2] * rows[2][c]
+        + w[3] * rows[3][c]
+        + w[4] * rows[4][c]
+    )
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract", "nsz"})
+def _operator_row(rows, tensor, twist, hourglass, w, wxx, mass, above, subtract, out):
+    """All terms at the posts of one row; ``above`` goes on to the next one.
+
+    Each cell is computed once: what it adds to the post at its right is kept in a register, what
+    it adds to the row below in ``above``.
+    """
+    zero, two = np.float32(0), np.float32(2)
+    u, below = rows[2], rows[3]
+    gpp, gpq, gqq = tensor
+    n = u.size
+    last_total = last_difference = last_bend = zero
+    behind = here = zero  # second differences along the row at the last post and at this one
+    for c in range(n - 2):
+        total, difference, bend = _cell_flux(u, below, c, gpp, gpq, gqq, twist, hourglass)
+        ahead = u[c] - two * u[c + 1] + u[c + 2]
+        cells = above[c] + ((bend - total) + (last_difference - last_bend))
+        along = wxx * (behind - two * here + ahead)
+        value = cells + along + _across(rows, w, c) + mass[c] * u[c]
+        above[c] = (last_total + last_bend) - (difference + bend)
+        out[c] = out[c] - value if subtract else value
+        last_total, last_difference, last_bend = total, difference, bend
+        behind, here = here, ahead
+    for c in range(max(n - 2, 0), n):
+        total, difference, bend = zero, zero, zero
+        if c < n - 1:
+            total, difference, bend = _cell_flux(u, below, c, gpp, gpq, gqq, twist, hourglass)
+        cells = above[c] + ((bend - total) + (last_difference - last_bend))
+        along = wxx * (behind - two * here)
+        value = cells + along + _across(rows, w, c) + mass[c] * u[c]
+        above[c] = (last_total + last_bend) - (difference + bend)
+        out[c] = out[c] - value if subtract else value
+        last_total, last_difference, last_bend = total, difference, bend
+        behind, here = here, zero
 
 
 @njit(cache=True, parallel=True)
+def _operator(u, gpp, gpq, gqq, curvature, hourglass, mass, subtract, out):
+    """``out = A u`` or ``out -= A u``; arguments as in `apply_operator`."""
+    rows, cols = u.shape
+    blocks = (rows + BLOCK - 1) // BLOCK
+    empty = np.zeros(max(cols - 1, 0), np.float32)
+    none = np.float32(0)
+    for block in prange(blocks):
+        first = np.int64(block) * BLOCK
+        last = min(first + BLOCK, rows)
+        above = np.zeros(cols, np.float32)
+        weights = np.zeros(5, np.float32)
+        twist, stiff = curvature[1], np.float32(hourglass)
+        if first > 0:
+            r = first - 1
+            k = min(r, gpp.shape[0] - 1)
+            _cells_above(u[r], u[r + 1], gpp[k], gpq[k], gqq[k], twist, stiff, above)
+        for r in range(first, last):
+            _column_weights(r, rows, weights)
+            weights *= curvature[2]
+            k = min(r, gpp.shape[0] - 1)
+            tensor = (gpp[k], gpq[k], gqq[k])
+            if r == rows - 1:  # no cells below
+                tensor, twist = (empty, empty, empty), none
+            _operator_row(
+                (
+                    u[max(r - 2, 0)],
+                    u[max(r - 1, 0)],
+                    u[r],
+                    u[min(r + 1, rows - 1)],
+                    u[min(r + 2, rows - 1)],
+                ),
+                tensor,
+                twist,
+                stiff,
+                weights,
+                curvature[0],
+                mass[min(r, mass.shape[0] - 1)],
+                above,
+                subtract,
+                out[r],
+            )
+
+
 def apply_operator(u, gpp, gpq, gqq, curvature, hourglass, mass, out):
     """``out = A u``.
 
@@ -93,68 +170,12 @@ def apply_operator(u, gpp, gpq, gqq, curvature, hourglass, mass, out):
     mass : float32 array (rows, cols) or (1, cols)
         Weight of each post; one row serves all when the weight is the same.
     """
-    rows, cols = u.shape
-    blocks = (rows + BLOCK - 1) // BLOCK
-    for block in prange(blocks):
-        first = np.int64(block) * BLOCK
-        last = min(first + BLOCK, rows)
-        flux = np.zeros((4, cols + 1), np.float32)
-        above = np.zeros((2, cols + 1), np.float32)
-        bend = np.zeros(cols + 2, np.float32)
-        weights = np.zeros(5, np.float32)
-        if first > 0:
-            r = first - 1
-            _cell_fluxes(
-                u[r],
-                u[r + 1],
-                gpp[min(r, gpp.shape[0] - 1)],
-                gpq[min(r, gpp.shape[0] - 1)],
-                gqq[min(r, gpp.shape[0] - 1)],
-                curvature[1],
-                np.float32(hourglass),
-                flux[0],
-                flux[1],
-                above[0],
-                above[1],
-            )
-        for r in range(first, last):
-            if r < rows - 1:
-                _cell_fluxes(
-                    u[r],
-                    u[r + 1],
-                    gpp[min(r, gpp.shape[0] - 1)],
-                    gpq[min(r, gpp.shape[0] - 1)],
-                    gqq[min(r, gpp.shape[0] - 1)],
-                    curvature[1],
-                    np.float32(hourglass),
-                    flux[0],
-                    flux[1],
-                    flux[2],
-                    flux[3],
-                )
-            else:
-                flux[:] = 0.0
-            _second_differences(u[r], bend)
-            _column_weights(r, rows, weights)
-            weights *= curvature[2]
-            _gather_row(
-                u[max(r - 2, 0)],
-                u[max(r - 1, 0)],
-                u[r],
-                u[min(r + 1, rows - 1)],
-                u[min(r + 2, rows - 1)],
-                weights,
-                curvature[0],
-                mass[min(r, mass.shape[0] - 1)],
-                bend,
-                flux[0],
-                flux[1],
-                above[0],
-                above[1],
-                out[r],
-            )
-            above[0] = flux[2]
-            above[1] = flux[3]
+    _operator(u, gpp, gpq, gqq, curvature, hourglass, mass, False, out)
+
+
+def subtract_operator(u, gpp, gpq, gqq, curvature, hourglass, mass, out):
+    """``out -= A u``: a residual after the step ``u``; arguments as in `apply_operator`."""
+    _operator(u, gpp, gpq, gqq, curvature, hourglass, mass, True, out)
 
 
 @njit(cache=True, parallel=True)
