@@ -13,9 +13,8 @@ import numpy as np
 from lommel.core.interpolation import refine_spline
 from lommel.core.multigrid import coarse_masses
 from lommel.core.reflectance import reflectance_model
-from lommel.errors import InputError, LommelError, UnreadableError
+from lommel.errors import InputError, UnreadableError
 from lommel.estimate.holes import fill_holes
-from lommel.estimate.measured_posts import measured_posts
 from lommel.estimate.priors import Priors
 from lommel.estimate.problem import Surroundings
 from lommel.estimate.shape_from_shading import Start, correlation, solve_surface
@@ -25,12 +24,11 @@ from lommel.run.inputs import known_heights
 from lommel.run.photometry import read_known
 from lommel.run.shape_from_shading import cell_grid, hillshade, seen_posts
 from lommel.run.tiles_plan import BLEND, coarse_grid
+from lommel.run.tiles_samples import named_files, photometry, solve_samples
 from lommel.run.views import read_views
 from lommel.scene.grid import Window
 
 REACH = 12  # coarse posts beyond which a spline's coefficients feel less than 1e-6 of a value
-SAMPLE = 513  # posts along each side of the windows that tell priors and photometry
-SAMPLES = 3  # of them along each side of a larger scene
 # Where tiles start: closer than this the coarse surface still errs by what its area means leave
 START_GAIN, START_STEP = 1e-3, 0.005
 # The coarse surface errs by what area means and a coarse grid leave. Held more firmly the rim
@@ -105,40 +103,42 @@ def prepare_scene(footprints, stride, settings, progress=silent):
     coarse = coarse_grid(footprints.grid, stride)
     scene = read_views(footprints.used, coarse, settings.masks, progress=progress)
     names = [view.name for view in scene.views]
-    samples = _samples(footprints, settings, scene.thresholds, progress)
-    priors = samples[0][1].priors
+    samples = solve_samples(footprints, stride, settings, scene.thresholds, progress)
+    priors, found = samples[0].value.priors, photometry(names, samples)
     initial = fill_holes(scene.heights)
     first = scene.views[0]
     base = float(np.mean(initial, dtype=float))
     surface = Surface(coarse, base, first.position if settings.parametrisation == "ray" else None)
     start = surface.posts_from_heights(initial)
-    exposures, hazes, misfits, noise = _photometry(names, samples)
-    fallback = np.isnan(noise)
     brightness = np.array([np.nanmean(view.image) for view in scene.views])
-    share = np.nanmedian(noise / brightness)
-    noise = np.where(fallback, share * brightness, noise)
-    albedo, photometry = read_known(settings.albedo, settings.exposures, cell_grid(coarse), names)
+    unseen = np.isnan(found.noise)
+    noise, coarse_misfits = (
+        _completed(values, brightness) for values in (found.noise, found.coarse_misfits)
+    )
+    on_coarse = coarse_priors(replace(priors, noise=noise), stride)
+    on_coarse = replace(on_coarse, noise=np.fmax(on_coarse.noise, coarse_misfits))
+    albedo, given = read_known(settings.albedo, settings.exposures, cell_grid(coarse), names)
     with step(progress, "coarse grid"):
         solution = solve_surface(
             surface,
             start,
             scene.views,
             reflectance_model(settings.reflectance),
-            coarse_priors(replace(priors, noise=noise), stride),
+            on_coarse,
             replace(settings.solver, gain_tolerance=START_GAIN, step_tolerance=START_STEP),
             albedo,
-            photometry,
+            given,
             maps=False,
         )
     value = solution.value
-    ratio = np.nanmedian(exposures / value.exposures)
+    ratio = np.nanmedian(found.exposures / value.exposures)
     known = Known(
         names,
-        np.where(fallback, ratio * value.exposures, exposures),
-        np.where(fallback, value.hazes, hazes),
+        np.where(unseen, ratio * value.exposures, found.exposures),
+        np.where(unseen, value.hazes, found.hazes),
         noise,
         np.array([np.nanmedian(image) for image in value.measured]),
-        np.where(fallback, np.nanmedian(misfits), misfits),
+        np.where(unseen, np.nanmedian(found.misfits), found.misfits),
         np.array([scene.thresholds[name] for name in names]),
         replace(priors, noise=noise),
         stride,
@@ -151,90 +151,13 @@ def prepare_scene(footprints, stride, settings, progress=silent):
     return known, solution, scene.skipped
 
 
-def named_files(files, names):
-    """The same files with only the images of these names."""
-    kept = [k for k, path in enumerate(files.images) if path.name in set(names)]
-    cameras = tuple(files.cameras[k] for k in kept) if files.cameras else ()
-    return replace(files, images=tuple(files.images[k] for k in kept), cameras=cameras)
-
-
-def _samples(footprints, settings, thresholds, progress):
-    """Names and solution of each window at full resolution, the scene's middle first.
-
-    Its priors hold for the next ones, as they will for the tiles; only an image that no window
-    before has seen needs the estimate of its noise.
-    """
-    windows = _sample_windows(footprints.grid.shape)
-    found, interpolated, noise = [], 0, {}
-    for window in progress(windows, "windows"):
-        part = footprints.grid.cut(window)
-        files = named_files(footprints.within(window), thresholds)
-        try:
-            scene = read_views(files, part, settings.masks, thresholds=thresholds)
-        except UnreadableError:
-            raise
-        except LommelError:
-            continue  # no image or no terrain here; the others tell
-        interpolated += measured_posts(scene.heights) is not None
-        names = [view.name for view in scene.views]
-        initial = fill_holes(scene.heights)
-        camera = scene.views[0].position if settings.parametrisation == "ray" else None
-        surface = Surface(part, float(np.mean(initial, dtype=float)), camera)
-        albedo, photometry = read_known(settings.albedo, settings.exposures, cell_grid(part), names)
-        priors = settings.priors
-        if set(names) <= set(noise):
-            priors = replace(found[0][1].priors, noise=np.array([noise[name] for name in names]))
-        solution = solve_surface(
-            surface,
-            surface.posts_from_heights(initial),
-            scene.views,
-            reflectance_model(settings.reflectance),
-            priors,
-            settings.solver,
-            albedo,
-            photometry,
-        )
-        found.append((names, solution.value))
-        own = zip(names, solution.value.priors.noise, strict=True)
-        noise = dict(own) | noise  # the first window that sees an image tells
-    if not found:
-        raise InputError(
-            "None of the windows at full resolution that tell noise and exposures holds an image "
-            "and terrain. Give --bounds where images and DEM lie."
-        )
-    if interpolated > len(found) / 2:
-        raise InputError(
-            "The DEM is interpolated between measured posts, which tiles cannot tell from terrain. "
-            "Give more --memory, a larger --spacing or narrower --bounds, so that one tile is all."
-        )
-    return found
-
-
-def _sample_windows(shape):
-    """Windows spread over the scene, the middle one first."""
-    rows, cols = (min(size, SAMPLE) for size in shape)
-    begins = []
-    for size, length in zip(shape, (rows, cols), strict=True):
-        count = 1 if size <= SAMPLE else SAMPLES
-        begins.append(np.linspace(0, size - length, count).astype(int).tolist())
-    windows = [Window(row, col, rows, cols) for row in begins[0] for col in begins[1]]
-    middle = windows.pop(len(windows) // 2)
-    return [middle, *windows]
-
-
-def _photometry(names, samples):
-    """Exposure, haze, misfit and noise of each image: means over windows that see it, or NaN."""
-    out = np.full((4, len(names)), np.nan)
-    for k, name in enumerate(names):
-        seen = [(value, found.index(name)) for found, value in samples if name in found]
-        if not seen:
-            continue
-        weights = [np.isfinite(value.measured[j]).sum() for value, j in seen]
-        out[0, k] = np.average([value.exposures[j] for value, j in seen], weights=weights)
-        out[1, k] = np.average([value.hazes[j] for value, j in seen], weights=weights)
-        out[2, k] = np.average([value.misfits[j] for value, j in seen], weights=weights)
-        out[3, k] = seen[0][0].priors.noise[seen[0][1]]
-    return out
+def _completed(values, brightness):
+    """Of images that have none (NaN), the share of the brightness that is common among the rest."""
+    is_known = np.isfinite(values)
+    if not is_known.any():
+        return values
+    share = np.median(values[is_known] / brightness[is_known])
+    return np.where(is_known, values, share * brightness)
 
 
 def coarse_priors(priors, stride):
