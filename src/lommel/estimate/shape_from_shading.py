@@ -58,6 +58,7 @@ from lommel.estimate.shading_kernels import SUM_COUNT, SUM_RR
 from lommel.estimate.surface_and_albedo import solve_jointly
 
 COARSEST = 24  # posts along the shorter side of the coarsest level that sees the images
+FLOOR = 1e-4  # gain, relative to the cost, that a step may promise and not keep at the very bottom
 NEAR = 1e-3  # expected gain of a step, relative to the cost, that a user need not wait for
 SETTLED = 0.1  # gain, relative to the cost, below which a surface moves shadows no more
 COARSE_STEPS = 4  # Gauss-Newton steps per coarse level at most; 2 on the largest of them
@@ -251,6 +252,8 @@ def solve_surface(
         finest.pin(measured, priors.roughness * spacing)
         if settings.estimate_haze is None:
             settings = replace(settings, estimate_haze=settings.estimate_exposure)
+    if settings.estimate_haze:
+        finest.hidden_slope = 0.0  # relief that coarse images are not believed would be haze
     if start is not None:
         finest.hold(start.u, start.hold)
     correlations = [
@@ -367,7 +370,7 @@ def _descend(level, u, steps, settings, history):
     here, last_gain, damping, equations = level.expand(u), 0.0, 0.0, None
     knows_shadows, is_near = level.stride > 1, False
     for _ in range(steps):
-        last, start = _best_cost(here, level, settings), u
+        last, start, hoped = _best_cost(here, level, settings), u, None
         for _ in range(ATTEMPTS):
             stiffen(here.tensors, damping)
             if equations is None:
@@ -384,6 +387,7 @@ def _descend(level, u, steps, settings, history):
                 settings.estimate_exposure and not level.frees_albedo,
             )
             gain = dot(here.gradient, linear.x) / 2
+            hoped = gain if hoped is None else hoped
             if level.stride == 1:
                 level.slide_along_views(linear.x, start)
             step = linear.x
@@ -397,8 +401,10 @@ def _descend(level, u, steps, settings, history):
                 break
             damping = more_damping(damping)
             u, here = start, _look(level, start)
+            if hoped < FLOOR * abs(last):
+                return start, True
         else:  # no way down: stay
-            return start, _is_small(u + step, start, level, settings)
+            return start, False
         level.albedo = here.albedo
         if not knows_shadows and gain < SETTLED * abs(cost):  # those of the start were its own
             level.see(u)
