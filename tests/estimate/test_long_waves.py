@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lommel.estimate.long_waves import Part, remainder, settle
+from lommel.estimate.long_waves import Part, _limited, remainder, settle
 from lommel.estimate.priors import Priors
 from lommel.estimate.problem import coarse_posts
 from lommel.scene.grid import Window
@@ -105,3 +105,14 @@ def test_derivatives_by_exposures_are_those_of_the_cost(albedo_error):
     for k in range(2):
         expected = (gradients[k, 1] - gradients[k, 0]) / (2 * step)
         np.testing.assert_allclose(left.coupling[k], expected, atol=0.03 * np.abs(expected).max())
+
+
+def test_no_place_is_moved_by_more_than_roughness_allows():
+    """Small steps stay as they are; of one that went astray 2 m are left."""
+    step = np.random.default_rng(5).normal(0, 0.05, (40, 50)).astype(np.float32)
+    step -= step.mean(dtype=float).astype(np.float32)
+    astray = step.copy()
+    astray[20, 30] = 80.0  # m
+    limited = _limited(astray, np.float32(2.0**-2))
+    assert np.abs(limited).max() <= 2.0
+    np.testing.assert_allclose(_limited(step, np.float32(2.0**-2)), step, atol=1e-3)  # m

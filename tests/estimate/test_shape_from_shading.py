@@ -13,6 +13,7 @@ from lommel.core.reflectance import reflectance_model
 from lommel.estimate.holes import fill_holes
 from lommel.estimate.measured_posts import measured_posts
 from lommel.estimate.priors import Priors
+from lommel.estimate.problem import fresh_problem
 from lommel.estimate.shape_from_shading import SolverSettings, solve_surface
 from lommel.estimate.surface import Surface
 from lommel.scene.geometry import Observation, surface_normals, viewing_geometry
@@ -214,6 +215,28 @@ def test_wildly_wrong_dem_is_reported_and_stays_finite(smooth, height):
     solution = solve_surface(Surface(grid, 0.0), wild, views, reflectance_model())
     assert solution.outcome != "converged"
     assert np.isfinite(solution.value.u).all()
+
+
+def test_coarse_images_are_weighed_by_what_the_truth_leaves_of_them():
+    """The residual of the true surface on coarse posts is about one of its standard errors.
+
+    Its posts are averages, its cells means over rough ground: the noise of the pixels' mean is a
+    fifth of the residual or less.
+    """
+    truth, _ = rough_scene(size=256)
+    grid = patch_grid(*truth.shape)
+    views = simulated_views(truth, grid, (100.0, 215.0))
+    level = fresh_problem(Surface(grid, 0.0), truth, views, reflectance_model(), None)
+    level.see(truth)
+    level.exposures[:] = EXPOSURE
+    level.expect(replace(weak_priors(2), roughness=0.155))  # what the priors find on this terrain
+    for stride in (2, 4, 8):
+        level = level.coarser()
+        for k, weight in enumerate(level.weights):
+            residual = (level.cells[k] - level.predict(level.initial, k))[2:-2, 2:-2]
+            left = np.sqrt(np.nanmean(residual**2))
+            assert left > 5 * NOISE / stride
+            assert 0.4 < left * weight**0.5 < 1.6
 
 
 def test_albedo_and_slope_are_told_apart_by_different_suns_only():

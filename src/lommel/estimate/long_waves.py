@@ -251,6 +251,16 @@ class _Settling(NormalEquations):
         self.add_exposures(-self.exposures_for @ self.pull_on_exposures(u), out)
 
 
+def _limited(step, curvature):
+    """The step, nowhere larger than heights change from post to post by their roughness.
+
+    On steep ground that is nearly dark parts may disagree by more than a linear step can tell: it
+    went tens of metres astray there, where all others are of decimetres.
+    """
+    most, step = np.float32(curvature**-0.5), step - step.mean(dtype=float).astype(np.float32)
+    return step / np.sqrt(1 + (step / most) ** 2)
+
+
 def settle(parts, shape, images, keeps_plane, stride, posts):
     """What is to be added to the blended parts.
 
@@ -298,6 +308,7 @@ def settle(parts, shape, images, keeps_plane, stride, posts):
     equations = _Settling(parts, tuple(tensors), images)
     equations.add_exposures(-equations.exposures_for @ on_exposures, gradient)
     step = conjugate_gradients(equations, -gradient, REDUCTION, MOST_CYCLES, keeps_plane).x
+    step = _limited(step, parts[0].left.curvature[0] * stride**2)
     exposures = -equations.exposures_for @ (on_exposures + equations.pull_on_exposures(step))
     # images tell no mean height, and where parts meet, coarse posts do not balance quite
     if not keeps_plane:
