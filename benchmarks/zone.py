@@ -25,9 +25,9 @@ DISK_RATE = 200e6  # bytes per second of a shared disk, both ways
 MARGIN = 4  # for real cameras, a cold disk, failures
 WEEK = 7 * 86_400.0
 
-# Core-seconds. Of 789 s on two cores for 4e8 posts and an image of 4.3e8 pixels, 63 prepared
-ONE_IMAGE = 2 * (789 - 63) / 4e8  # per post, to solve with one image and write
-PREPARE = 2 * 63 / 4.3e8  # per pixel: digest, samples, coarse stage; at most, it has the DEM in it
+# Core-seconds. Of 568 s on two cores for 4e8 posts and an image of 4.3e8 pixels, 37 prepared
+ONE_IMAGE = 2 * (568 - 37) / 4e8  # per post, to solve with one image and write
+PREPARE = 2 * 37 / 4.3e8  # per pixel: digest, samples, coarse stage; at most, it has the DEM in it
 FURTHER = 0.25e-6  # per post of a tile and further image
 ALBEDO = 2 * 386 / 1e9  # per pixel of 40 orthoimages of 5000 x 5000, all of the command
 ANEW = 1.25  # workers compute samples in every pass
