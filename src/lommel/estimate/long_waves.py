@@ -252,7 +252,7 @@ class _Settling(NormalEquations):
 
 
 def _limited(step, curvature):
-    """The step, nowhere larger than heights change from post to post by their roughness.
+    """The step less its mean, nowhere larger than heights change from post to post by roughness.
 
     On steep ground that is nearly dark parts may disagree by more than a linear step can tell: it
     went tens of metres astray there, where all others are of decimetres.

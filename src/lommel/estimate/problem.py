@@ -40,8 +40,8 @@ LOWEST_VIEW = 0.1  # sine of the elevation below which a view is taken for no lo
 DARK = 0.5  # of the median brightness: the image itself denies a shadow that is brighter
 NOT_COUPLED = np.empty((4, 0, 0), np.float32)
 # Slope that the images of a coarse cell show and its averaged posts do not have, as a share of the
-# roughness: at true surfaces of simulated scenes 0.06 on every second post, 0.09 to 0.18 on every
-# 4th to 16th
+# roughness: at true surfaces of simulated scenes 0.04 to 0.08 on every second post, 0.09 to 0.18 on
+# every 4th to 16th (design/sfs_coarse_misfit.py)
 HIDDEN_SLOPE = 0.11
 HUBER_SCALE = 3.0  # noise standard errors from which a residual counts as an outlier
 

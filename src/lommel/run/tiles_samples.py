@@ -48,7 +48,9 @@ class Sample:
 
 @dataclass(frozen=True)
 class Photometry:
-    """What the windows tell of each image, means over those that see it; NaN where none does.
+    """What the windows that see an image tell of it; NaN where none does.
+
+    Exposures, hazes and misfits are means, coarse misfits medians; noise is that of the first one.
 
     Attributes
     ----------
